@@ -1,0 +1,61 @@
+"""cpjax: a motor-driven cart-pole in pure JAX.
+
+A plant, a controller and a start go in; a trajectory, its metrics and their derivatives come out, for one start or a
+million. Importing this package starts no JAX backend, draws nothing and changes none of JAX's settings.
+"""
+
+from importlib.metadata import PackageNotFoundError, version
+
+from cpjax import paper
+from cpjax.controllers import (
+    REGULATE,
+    SWING_UP,
+    AngleGate,
+    AngleRateGate,
+    EnergySwingUp,
+    Hybrid,
+    LyapunovGate,
+    StateFeedback,
+)
+from cpjax.errors import InvalidInput
+from cpjax.plant import CartPole, LinearModel, Motor, linearize
+from cpjax.sim.flags import Flag
+from cpjax.sim.metrics import Metrics, ProtocolMetrics
+from cpjax.sim.rollout import Trajectory, measure, rollout
+from cpjax.sim.sweep import sweep
+from cpjax.starts import sample_starts
+from cpjax.state import HANGING, UPRIGHT, State
+
+try:
+    __version__ = version("cpjax")
+except PackageNotFoundError:  # run from a source tree that was never installed
+    __version__ = "0+unknown"
+
+__all__ = [
+    "HANGING",
+    "REGULATE",
+    "SWING_UP",
+    "UPRIGHT",
+    "AngleGate",
+    "AngleRateGate",
+    "CartPole",
+    "EnergySwingUp",
+    "Flag",
+    "Hybrid",
+    "InvalidInput",
+    "LinearModel",
+    "LyapunovGate",
+    "Metrics",
+    "Motor",
+    "ProtocolMetrics",
+    "State",
+    "StateFeedback",
+    "Trajectory",
+    "__version__",
+    "linearize",
+    "measure",
+    "paper",
+    "rollout",
+    "sample_starts",
+    "sweep",
+]

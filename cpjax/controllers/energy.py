@@ -1,0 +1,57 @@
+"""Swing-up by energy (Astrom and Furuta, 2000), with the paper's signs mended.
+
+With E the pendulum's energy about its pivot, zero upright at rest, and x'' = a the pivot's acceleration,
+
+    dE/dt = m l a theta' cos(theta) - (pivot friction)
+
+so a = -k E theta' cos(theta) drives E to zero from either side. The law asks for an acceleration; the voltage that
+yields it follows from its own model of the plant, which need not be the true one.
+"""
+
+from cpjax.numeric.trigonometry import sin_cos
+from cpjax.plant import CartPole
+from cpjax.pytree import Scalar, number, part, pytree
+from cpjax.state import State
+
+
+@pytree
+class EnergySwingUp:
+    """The corrected energy law, optional centring of the cart, and a kick that leaves the hanging rest.
+
+        a = -energy_gain E theta' cos(theta) - (1 - s) (cart_stiffness x + cart_damping x') + s kick
+
+    Hanging at rest, the energy law alone asks for nothing and would wait for rounding noise. The kick is a push of
+    `kick` [m/s^2] towards positive x, weighted by s = (1 - w)^3 for w < 1 and 0 beyond, where w is the pendulum's
+    energy above hanging, in units of the energy of a swing of amplitude `kick_radius`. So s is 1 hanging at rest, falls
+    to 0 (with two continuous derivatives) within a swing of `kick_radius`, and elsewhere the law is exactly the energy
+    law. Inside, the kick takes the place of the centring, which could otherwise balance it and hold the cart.
+    """
+
+    model: CartPole = part("the law's own idea of the plant, a CartPole", "force_for_acceleration", "motor")
+    energy_gain: Scalar = number("m/(J s)", "k, cart acceleration per E theta' cos(theta)", at_least=0.0)
+    cart_stiffness: Scalar = number("1/s^2", "pull of the cart to x = 0", default=0.0, at_least=0.0)
+    cart_damping: Scalar = number("1/s", "damping of the cart", default=0.0, at_least=0.0)
+    kick: Scalar = number("m/s^2", "acceleration hanging at rest; 0 for none", default=0.5)
+    kick_radius: Scalar = number("rad", "swing amplitude beyond which the kick is gone", default=0.02, above=0.0)
+
+    def acceleration(self, state: State) -> Scalar:
+        """The pivot acceleration that the law asks for [m/s^2]."""
+        _, cos = sin_cos(state.theta)
+        energy = self.model.pendulum_energy(state)
+        pump = -self.energy_gain * energy * state.theta_dot * cos
+        centring = -(self.cart_stiffness * state.x + self.cart_damping * state.x_dot)
+        near = self._kick_weight(state)
+        return pump + (1.0 - near) * centring + near * self.kick
+
+    def voltage(self, state: State) -> Scalar:
+        """Demanded voltage [V]: the one that yields `acceleration` on the law's model; unclipped."""
+        force = self.model.force_for_acceleration(state, self.acceleration(state))
+        return self.model.motor.voltage_for_force(force, state.x_dot)
+
+    def _kick_weight(self, state: State) -> Scalar:
+        _, cos = sin_cos(state.theta)
+        weight = self.model.pole_mass * self.model.gravity * self.model.pole_length
+        above_rest = 0.5 * self.model.pivot_inertia * state.theta_dot * state.theta_dot / weight + (1.0 + cos)
+        room = 1.0 - above_rest / (0.5 * self.kick_radius * self.kick_radius)
+        inside = 0.5 * (room + abs(room))  # max(room, 0); its kink at 0 vanishes in the cube
+        return inside * inside * inside

@@ -1,0 +1,28 @@
+"""Linear state feedback."""
+
+import jax
+
+from cpjax.numeric.trigonometry import wrap_angle
+from cpjax.pytree import Scalar, matrix, part, pytree
+from cpjax.state import NAMES, UPRIGHT, State
+
+
+@pytree
+class StateFeedback:
+    """u = -K (s - s_ref), with the angle's error taken modulo a turn. A controller on its own, or Hybrid's regulator.
+
+    A plain sequence of four gains is accepted for K.
+    """
+
+    K: jax.Array = matrix((1, 4), "V per unit of state", "gain, u = -K (s - s_ref)")
+    reference: State = part("the state to hold, a State", *NAMES, default=UPRIGHT)
+
+    def voltage(self, state: State) -> Scalar:
+        """Demanded voltage [V]."""
+        k = self.K
+        return -(
+            k[0, 0] * (state.x - self.reference.x)
+            + k[0, 1] * (state.x_dot - self.reference.x_dot)
+            + k[0, 2] * wrap_angle(state.theta - self.reference.theta)
+            + k[0, 3] * (state.theta_dot - self.reference.theta_dot)
+        )

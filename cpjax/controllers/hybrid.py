@@ -1,0 +1,34 @@
+"""The hybrid law: a swing-up law outside a gate, a regulator inside it."""
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.controllers.gates import Gate
+from cpjax.controllers.protocol import REGULATE, SWING_UP, Law
+from cpjax.pytree import Scalar, part, pytree
+from cpjax.state import State
+
+
+@pytree
+class Hybrid:
+    """Swing-up law, regulator and the gate between them.
+
+    A rollout that starts between the two boundaries of a gate with hysteresis starts in the swing-up law: without a
+    past, only the way in counts.
+    """
+
+    swing_up: Law = part("a law", "voltage")
+    regulator: Law = part("a law", "voltage")
+    gate: Gate = part("a gate", "margin")
+
+    def start_mode(self, state: State) -> jax.Array:
+        """REGULATE inside the way in, SWING_UP elsewhere."""
+        return self.next_mode(state, jnp.asarray(SWING_UP, dtype=jnp.int32))
+
+    def next_mode(self, state: State, mode: jax.Array) -> jax.Array:
+        """REGULATE where the gate's margin in the present mode is at least 0. Has no derivative: it is a switch."""
+        return jnp.where(self.gate.margin(state, mode) >= 0.0, REGULATE, SWING_UP).astype(jnp.int32)
+
+    def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
+        """Both laws are evaluated and one is taken; the other contributes neither value nor derivative."""
+        return jnp.where(mode == REGULATE, self.regulator.voltage(state), self.swing_up.voltage(state))

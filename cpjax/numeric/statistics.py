@@ -1,0 +1,43 @@
+"""Success rates with their uncertainty."""
+
+import math
+from statistics import NormalDist
+
+from cpjax.errors import InvalidInput
+
+
+def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Two-sided Wilson score interval of a proportion (Wilson, 1927): `(low, high)` within [0, 1].
+
+    Raises:
+      InvalidInput: `trials` below 1, or `successes` outside 0..trials.
+    """
+    _check_counts(successes, trials)
+    z = NormalDist().inv_cdf(0.5 + confidence / 2)
+    p = successes / trials
+    centre = p + z * z / (2 * trials)
+    spread = z * math.sqrt(p * (1 - p) / trials + (z / (2 * trials)) ** 2)
+    scale = 1 + z * z / trials
+    # At 0 and at 1 the end is exact; rounding must not move it inside.
+    low = 0.0 if successes == 0 else (centre - spread) / scale
+    high = 1.0 if successes == trials else (centre + spread) / scale
+    return low, high
+
+
+def two_proportion_p_value(successes_a: int, trials_a: int, successes_b: int, trials_b: int) -> float:
+    """p-value of the two-sided, pooled two-proportion z-test; 1.0 where both rates are all or nothing alike."""
+    _check_counts(successes_a, trials_a)
+    _check_counts(successes_b, trials_b)
+    pooled = (successes_a + successes_b) / (trials_a + trials_b)
+    variance = pooled * (1 - pooled) * (1 / trials_a + 1 / trials_b)
+    if variance == 0:
+        return 1.0
+    z = (successes_a / trials_a - successes_b / trials_b) / math.sqrt(variance)
+    return 2 * NormalDist().cdf(-abs(z))
+
+
+def _check_counts(successes: int, trials: int) -> None:
+    if trials < 1:
+        raise InvalidInput("trials", trials, "a whole number, at least 1")
+    if not 0 <= successes <= trials:
+        raise InvalidInput("successes", successes, f"a whole number from 0 to trials = {trials}")

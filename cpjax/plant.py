@@ -1,0 +1,227 @@
+"""The plant: a cart with a pendulum, driven by a DC motor through its wheels.
+
+With M = cart_mass + reflected rotor mass, m = pole_mass, l = pole_length, J = pole_inertia, c = cart_friction,
+b = pivot_friction and F the horizontal force of the wheels, the Lagrangian
+
+    L = 1/2 M x'^2 + 1/2 m ((x' - l th' cos th)^2 + (l th' sin th)^2) + 1/2 J th'^2 - m g l cos th
+
+gives (paper, section III, with its sign error mended; see docs/paper.md)
+
+    (M + m) x'' - m l cos(th) th'' = F - c x' - m l sin(th) th'^2
+    (J + m l^2) th'' - m l cos(th) x'' = m g l sin(th) - b th'
+
+`CartPole.acceleration` is the only place that solves these for x'' and th''.
+"""
+
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cpjax.errors import InvalidInput
+from cpjax.numeric.trigonometry import sin_cos
+from cpjax.pytree import Scalar, is_traced, number, part, pytree
+from cpjax.state import HANGING, UPRIGHT, State
+
+
+@pytree
+class Motor:
+    """A DC motor without inductance, a gear and a wheel that does not slip. Defaults: the paper's appendix.
+
+    Terminal voltage u gives the current i = (u - k_V n x' / r) / R, and the wheels push the cart with
+    F = n k_T i / r - n^2 B_m x' / r^2.
+    """
+
+    torque_constant: Scalar = number("N m/A", "torque per current, k_T", default=1.25, above=0.0)
+    back_emf_constant: Scalar = number("V s/rad", "voltage per rotor speed, k_V", default=1.0, at_least=0.0)
+    resistance: Scalar = number("ohm", "resistance of the winding, R", default=1.25, above=0.0)
+    rotor_inertia: Scalar = number("kg m^2", "rotor inertia, J_m", default=7e-6, at_least=0.0)
+    viscous_friction: Scalar = number("N m s/rad", "bearing friction, B_m", default=1e-5, at_least=0.0)
+    wheel_radius: Scalar = number("m", "wheel radius, r", default=1.0, above=0.0)
+    gear_ratio: Scalar = number("1", "rotor turns per wheel turn, n", default=1.0, above=0.0)
+    voltage_limit: Scalar = number("V", "supply: |u| is clipped here", default=12.0, above=0.0, infinite=True)
+
+    def saturate(self, voltage: Scalar) -> jax.Array:
+        """The demanded voltage [V] clipped to the supply. Derivative 1 inside, 0 outside, 1/2 exactly on the limit."""
+        return jnp.clip(voltage, -self.voltage_limit, self.voltage_limit)
+
+    def current(self, voltage: Scalar, x_dot: Scalar) -> Scalar:
+        """Current in the winding [A] at an applied voltage [V] and cart velocity [m/s]."""
+        return (voltage - self.back_emf_constant * self.gear_ratio / self.wheel_radius * x_dot) / self.resistance
+
+    def force(self, voltage: Scalar, x_dot: Scalar) -> Scalar:
+        """Horizontal force of the wheels on the cart [N].
+
+        F = (n k_T / (R r)) u - n^2 (B_m + k_T k_V / R) x' / r^2        (paper, section III; r = 1 m and n = 1 there)
+
+        Args:
+          voltage: terminal voltage [V], already clipped to the supply.
+          x_dot: cart velocity [m/s].
+        """
+        return self.force_per_voltage * voltage - self.damping * x_dot
+
+    def voltage_for_force(self, force: Scalar, x_dot: Scalar) -> Scalar:
+        """Terminal voltage [V] at which the wheels push with `force` [N] at cart velocity `x_dot` [m/s]; unclipped."""
+        return (force + self.damping * x_dot) / self.force_per_voltage
+
+    @property
+    def force_per_voltage(self) -> Scalar:
+        """n k_T / (R r) [N/V]."""
+        return self.gear_ratio * self.torque_constant / (self.resistance * self.wheel_radius)
+
+    @property
+    def damping(self) -> Scalar:
+        """Bearing friction and back-EMF together, as a damping of the cart [N s/m]: n^2 (B_m + k_T k_V / R) / r^2."""
+        ratio = self.gear_ratio / self.wheel_radius
+        return ratio * ratio * (self.viscous_friction + self.torque_constant * self.back_emf_constant / self.resistance)
+
+    @property
+    def reflected_mass(self) -> Scalar:
+        """The rotor's inertia as a mass at the cart [kg]: n^2 J_m / r^2."""
+        ratio = self.gear_ratio / self.wheel_radius
+        return ratio * ratio * self.rotor_inertia
+
+
+class LinearModel(NamedTuple):
+    """s' = A s + B u about an equilibrium, in the state order x, x_dot, theta, theta_dot."""
+
+    A: jax.Array
+    """Shape (4, 4)."""
+    B: jax.Array
+    """Shape (4, 1), per volt."""
+
+
+@pytree
+class CartPole:
+    """Cart, pole and motor. Defaults: the paper's appendix (a point bob on a massless pole, no friction)."""
+
+    cart_mass: Scalar = number("kg", "mass of the cart, m_1", default=1.0, above=0.0)
+    pole_mass: Scalar = number("kg", "mass of the pole, m_2", default=0.5, above=0.0)
+    pole_length: Scalar = number("m", "pivot to the pole's centre of mass, l", default=0.7, above=0.0)
+    gravity: Scalar = number("m/s^2", "gravity, g", default=9.81, above=0.0)
+    pole_inertia: Scalar = number("kg m^2", "pole inertia about its centre of mass, J", default=0.0, at_least=0.0)
+    cart_friction: Scalar = number("N s/m", "viscous friction of the cart, c", default=0.0, at_least=0.0)
+    pivot_friction: Scalar = number("N m s/rad", "viscous friction of the pivot, b", default=0.0, at_least=0.0)
+    motor: Motor = part("a cpjax.Motor", "saturate", "force", "reflected_mass", default_factory=Motor)
+
+    @classmethod
+    def rod(cls, *, mass: Scalar, length: Scalar, **others: Any) -> "CartPole":
+        """A uniform rod of `mass` [kg] and whole `length` [m] on the pivot: l = length / 2, J = mass length^2 / 12.
+
+        Args:
+          others: the remaining fields of `CartPole`.
+        """
+        return cls(pole_mass=mass, pole_length=length / 2, pole_inertia=mass * length * length / 12, **others)
+
+    @property
+    def moving_mass(self) -> Scalar:
+        """Cart and reflected rotor together, M [kg]."""
+        return self.cart_mass + self.motor.reflected_mass
+
+    @property
+    def pivot_inertia(self) -> Scalar:
+        """The pole's inertia about its pivot, J + m l^2 [kg m^2]."""
+        return self.pole_inertia + self.pole_mass * self.pole_length * self.pole_length
+
+    def acceleration(
+        self, sin: Scalar, cos: Scalar, rates: tuple[Scalar, Scalar], force: Scalar
+    ) -> tuple[Scalar, Scalar]:
+        """Accelerations `(x'', theta'')` [m/s^2, rad/s^2]: the equations of motion in the module's docstring, solved.
+
+        Args:
+          sin: sine of theta.
+          cos: cosine of theta.
+          rates: `(x_dot, theta_dot)` [m/s, rad/s].
+          force: of the wheels on the cart [N].
+        """
+        x_dot, theta_dot = rates
+        m, inertia = self.pole_mass, self.pivot_inertia
+        ml = m * self.pole_length
+        push = force - self.cart_friction * x_dot - ml * theta_dot * theta_dot * sin
+        torque = ml * self.gravity * sin - self.pivot_friction * theta_dot
+        # (M + m)(J + m l^2) - (m l cos)^2, written as a sum of positive terms so that nothing cancels
+        determinant = (self.moving_mass + m) * self.pole_inertia + ml * self.pole_length * (
+            self.moving_mass + m * sin * sin
+        )
+        x_ddot = (inertia * push + ml * cos * torque) / determinant
+        theta_ddot = ((self.moving_mass + m) * torque + ml * cos * push) / determinant
+        return x_ddot, theta_ddot
+
+    def vector_field(self, state: State, voltage: Scalar) -> State:
+        """Time derivative of `state` under the applied (already clipped) terminal `voltage` [V]."""
+        sin, cos = sin_cos(state.theta)
+        force = self.motor.force(voltage, state.x_dot)
+        x_ddot, theta_ddot = self.acceleration(sin, cos, (state.x_dot, state.theta_dot), force)
+        return State(state.x_dot, x_ddot, state.theta_dot, theta_ddot)
+
+    def force_for_acceleration(self, state: State, x_ddot: Scalar) -> Scalar:
+        """Wheel force [N] under which the cart accelerates with `x_ddot` [m/s^2]: the equations of motion, inverted."""
+        sin, cos = sin_cos(state.theta)
+        ml = self.pole_mass * self.pole_length
+        torque = ml * self.gravity * sin - self.pivot_friction * state.theta_dot
+        theta_ddot = (ml * cos * x_ddot + torque) / self.pivot_inertia
+        return (
+            (self.moving_mass + self.pole_mass) * x_ddot
+            - ml * cos * theta_ddot
+            + ml * sin * state.theta_dot * state.theta_dot
+            + self.cart_friction * state.x_dot
+        )
+
+    def kinetic_energy(self, state: State) -> Scalar:
+        """Of cart, rotor and pole [J]."""
+        _, cos = sin_cos(state.theta)
+        coupling = self.pole_mass * self.pole_length * cos * state.x_dot * state.theta_dot
+        cart = 0.5 * (self.moving_mass + self.pole_mass) * state.x_dot * state.x_dot
+        return cart - coupling + 0.5 * self.pivot_inertia * state.theta_dot * state.theta_dot
+
+    def potential_energy(self, state: State) -> Scalar:
+        """m g l cos(theta) [J]: zero at the pivot's height."""
+        _, cos = sin_cos(state.theta)
+        return self.pole_mass * self.gravity * self.pole_length * cos
+
+    def total_energy(self, state: State) -> Scalar:
+        """Kinetic and potential [J]."""
+        return self.kinetic_energy(state) + self.potential_energy(state)
+
+    def pendulum_energy(self, state: State) -> Scalar:
+        """Energy of the pole about a pivot at rest [J]; zero upright at rest, -2 m g l hanging at rest.
+
+        E = 1/2 (J + m l^2) theta'^2 + m g l (cos(theta) - 1)        (paper, section IV-C)
+        """
+        _, cos = sin_cos(state.theta)
+        weight = self.pole_mass * self.gravity * self.pole_length
+        return 0.5 * self.pivot_inertia * state.theta_dot * state.theta_dot + weight * (cos - 1.0)
+
+    def dissipated_power(self, state: State) -> Scalar:
+        """Power lost in the cart's and the pivot's friction [W]; the motor's own losses are inside the wheel force."""
+        cart = self.cart_friction * state.x_dot * state.x_dot
+        return cart + self.pivot_friction * state.theta_dot * state.theta_dot
+
+
+def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | State = "upright") -> LinearModel:
+    """A (4, 4) and B (4, 1) of the plant about an equilibrium with zero voltage, by forward differentiation.
+
+    Args:
+      equilibrium: "upright", "hanging", or a State at rest in which nothing accelerates (the cart may stand anywhere).
+
+    Raises:
+      InvalidInput: `equilibrium` is another word, or a concrete State that is none.
+    """
+    named = {"upright": UPRIGHT, "hanging": HANGING}
+    if isinstance(equilibrium, str):
+        if equilibrium not in named:
+            raise InvalidInput("equilibrium", equilibrium, "upright, hanging or a State")
+        equilibrium = named[equilibrium]
+
+    def field(vector: jax.Array, voltage: jax.Array) -> jax.Array:
+        return plant.vector_field(State.from_vector(vector), voltage).vector()
+
+    dtype = jnp.result_type(float, *(leaf for leaf in jax.tree.leaves(plant) if hasattr(leaf, "dtype")))
+    vector = jnp.asarray(equilibrium.vector(), dtype=dtype)
+    voltage = jnp.zeros((), dtype=dtype)
+    drift = field(vector, voltage)
+    if not is_traced(drift) and float(np.max(np.abs(np.asarray(drift)))) > 1e-4:
+        raise InvalidInput("equilibrium", equilibrium, "a state at rest in which nothing accelerates")
+    A, B = jax.jacfwd(field, argnums=(0, 1))(vector, voltage)
+    return LinearModel(A, B[:, None])

@@ -1,0 +1,234 @@
+"""Frozen dataclasses that JAX can take apart, with units and ranges declared beside each field.
+
+A class decorated with `pytree` is an immutable dataclass whose numbers are JAX leaves and whose choices (`choice`) are
+static. What a user constructs is checked against the declared ranges; what JAX rebuilds is not, because JAX fills the
+leaves with tracers, `None`, axis numbers and zeros of an optimiser. The same declarations feed the command line's options,
+the files' keys and the documentation, so that a parameter is described in one place.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, TypeAlias, TypeVar, dataclass_transform
+
+import jax
+import numpy as np
+
+from cpjax.errors import InvalidInput
+
+Scalar: TypeAlias = jax.Array | float
+"""One real number: a Python float, or an array of shape () that JAX may trace. Batches appear only under `vmap`."""
+
+T = TypeVar("T")
+_RULE = "cpjax"  # key of a field's declaration in dataclasses' metadata
+
+
+@dataclasses.dataclass(frozen=True)
+class Number:
+    """Declaration of a real-valued field: unit, one line of help, and the open or closed ends of its range."""
+
+    unit: str
+    help: str
+    above: float = -math.inf
+    at_least: float = -math.inf
+    below: float = math.inf
+    at_most: float = math.inf
+    infinite: bool = False
+
+    def allowed(self) -> str:
+        """The range in words, as error messages and `--help` print it."""
+        ends = [
+            f"above {self.above:g}" if self.above > -math.inf else "",
+            f"at least {self.at_least:g}" if self.at_least > -math.inf else "",
+            f"below {self.below:g}" if self.below < math.inf else "",
+            f"at most {self.at_most:g}" if self.at_most < math.inf else "",
+        ]
+        kind = "a number" if self.infinite else "a finite number"
+        return " ".join([kind, " and ".join(e for e in ends if e), f"[{self.unit}]"]).replace("  ", " ")
+
+    def normalise(self, name: str, value: Any) -> Any:
+        if isinstance(value, np.generic):
+            value = value.item()
+        if isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        numbers = _concrete_reals(name, value, self.allowed())
+        if numbers is not None and not self._holds(numbers):
+            raise InvalidInput(name, value, self.allowed())
+        return value
+
+    def _holds(self, v: np.ndarray) -> bool:
+        real = ~np.isnan(v) if self.infinite else np.isfinite(v)
+        inside = (v > self.above) | (self.above == -math.inf)
+        inside &= (v >= self.at_least) & ((v < self.below) | (self.below == math.inf)) & (v <= self.at_most)
+        return bool(np.all(real & inside))
+
+
+@dataclasses.dataclass(frozen=True)
+class Matrix:
+    """Declaration of an array-valued field: its last axes have `shape`; axes before them are a batch."""
+
+    shape: tuple[int, ...]
+    unit: str
+    help: str
+    symmetric: bool = False
+
+    def allowed(self) -> str:
+        kind = "symmetric finite" if self.symmetric else "finite"
+        return f"a {kind} array of shape {self.shape} [{self.unit}]"
+
+    def normalise(self, name: str, value: Any) -> Any:
+        if isinstance(value, (list, tuple)) and not _holds_tracers(value):
+            try:
+                value = np.asarray(value, dtype=float)
+            except (TypeError, ValueError) as problem:
+                raise InvalidInput(name, value, self.allowed()) from problem
+        if not hasattr(value, "shape"):
+            raise InvalidInput(name, value, self.allowed())
+        if self.shape[0] == 1 and value.shape == self.shape[1:]:
+            value = value.reshape(self.shape)  # a plain row is welcome where a one-row matrix is meant
+        if value.shape[-len(self.shape) :] != self.shape:
+            raise InvalidInput(name, f"array of shape {value.shape}", self.allowed())
+        numbers = _concrete_reals(name, value, self.allowed())
+        if numbers is None:
+            return value
+        scale = np.max(np.abs(numbers), initial=0.0)
+        skewed = self.symmetric and not np.allclose(numbers, np.swapaxes(numbers, -1, -2), rtol=0, atol=1e-6 * scale)
+        if not np.all(np.isfinite(numbers)) or skewed:
+            raise InvalidInput(name, value, self.allowed())
+        return value
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """Declaration of a field that holds another component: one with all of the named methods or attributes."""
+
+    help: str
+    needs: tuple[str, ...]
+
+    def normalise(self, name: str, value: Any) -> Any:
+        missing = [attribute for attribute in self.needs if not hasattr(value, attribute)]
+        if missing:
+            raise InvalidInput(name, value, f"{self.help} (with {', '.join(self.needs)})")
+        return value
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Declaration of a static field: one of a few values; another value means another compilation."""
+
+    help: str
+    options: tuple[Any, ...]
+
+    def normalise(self, name: str, value: Any) -> Any:
+        if value not in self.options:
+            raise InvalidInput(name, value, "one of " + ", ".join(map(str, self.options)))
+        return value
+
+
+Rule: TypeAlias = Number | Matrix | Part | Choice
+
+
+def number(unit: str, help: str, *, default: Any = dataclasses.MISSING, **ends: Any) -> Any:
+    """A real-valued field. `ends` are `above`, `at_least`, `below`, `at_most`, `infinite` (see `Number`)."""
+    return dataclasses.field(default=default, metadata={_RULE: Number(unit, help, **ends)})
+
+
+def matrix(shape: tuple[int, ...], unit: str, help: str, *, symmetric: bool = False) -> Any:
+    """An array-valued field (see `Matrix`)."""
+    return dataclasses.field(metadata={_RULE: Matrix(shape, unit, help, symmetric)})
+
+
+def part(help: str, *needs: str, default: Any = dataclasses.MISSING, default_factory: Any = dataclasses.MISSING) -> Any:
+    """A field that holds another component (see `Part`)."""
+    rule = {_RULE: Part(help, needs)}
+    if default_factory is not dataclasses.MISSING:
+        return dataclasses.field(default_factory=default_factory, metadata=rule)
+    return dataclasses.field(default=default, metadata=rule)
+
+
+def choice(help: str, *options: Any, default: Any = dataclasses.MISSING) -> Any:
+    """A static field, one of `options` (see `Choice`)."""
+    return dataclasses.field(default=default, metadata={_RULE: Choice(help, options)})
+
+
+def rules(cls: type) -> dict[str, Rule]:
+    """The declarations of a `pytree` class, by field name, in order."""
+    return {f.name: f.metadata[_RULE] for f in dataclasses.fields(cls) if _RULE in f.metadata}
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=False, field_specifiers=(number, matrix, part, choice))
+def pytree(cls: type[T]) -> type[T]:
+    """Class decorator: frozen dataclass, registered with JAX, checked when a user constructs it.
+
+    Raises (from the constructor):
+      InvalidInput: a concrete value outside its declared range, not a number, or of the wrong shape or dtype.
+    """
+    checked = hasattr(cls, "__post_init__")
+
+    def check_fields(self: Any) -> None:
+        for name, rule in rules(cls).items():
+            object.__setattr__(self, name, rule.normalise(f"{cls.__name__}.{name}", getattr(self, name)))
+
+    if checked:
+        own: Callable[[Any], None] = cls.__post_init__  # type: ignore[attr-defined]  # hasattr was just tested
+
+        def post_init(self: Any) -> None:
+            check_fields(self)
+            own(self)
+
+        cls.__post_init__ = post_init  # type: ignore[attr-defined]  # as above
+    else:
+        cls.__post_init__ = check_fields  # type: ignore[attr-defined]  # added for dataclass() below
+
+    # Equality stays identity: comparing fields that hold arrays has no single truth value.
+    cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    declared = rules(cls)
+    names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]  # a dataclass since the line above
+    static = [n for n in names if isinstance(declared.get(n), Choice)]
+    dynamic = [n for n in names if n not in static]
+
+    def flatten_with_keys(tree: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+        leaves = [(jax.tree_util.GetAttrKey(n), getattr(tree, n)) for n in dynamic]
+        return leaves, tuple(getattr(tree, n) for n in static)
+
+    def flatten(tree: Any) -> tuple[list[Any], tuple[Any, ...]]:
+        return [getattr(tree, n) for n in dynamic], tuple(getattr(tree, n) for n in static)
+
+    def unflatten(choices: tuple[Any, ...], leaves: Any) -> T:
+        # Bypasses __init__ and with it the checks: JAX's leaves may be anything.
+        tree = object.__new__(cls)
+        for name, value in (*zip(dynamic, leaves, strict=True), *zip(static, choices, strict=True)):
+            object.__setattr__(tree, name, value)
+        return tree
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    return cls
+
+
+def is_traced(value: Any) -> bool:
+    """Whether JAX is tracing through `value`, so that it has no number to look at."""
+    return isinstance(value, jax.core.Tracer)
+
+
+def cast(tree: T, dtype: Any) -> T:
+    """`tree` with every leaf as a JAX array of `dtype`. Traced leaves are converted too, with their derivatives."""
+    import jax.numpy as jnp
+
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=dtype), tree)
+
+
+def _holds_tracers(value: Any) -> bool:
+    return any(is_traced(leaf) for leaf in jax.tree.leaves(value))
+
+
+def _concrete_reals(name: str, value: Any, allowed: str) -> np.ndarray | None:
+    """`value` as a float array, or None where it is traced and cannot be looked at."""
+    if is_traced(value):
+        return None
+    if isinstance(value, float):
+        return np.asarray(value)
+    dtype = getattr(value, "dtype", None)
+    if dtype is None or not jax.numpy.issubdtype(dtype, np.floating):
+        kind = f" of dtype {dtype}" if dtype is not None else ""
+        raise InvalidInput(name, f"{value}{kind}" if kind else value, f"{allowed}, of a floating-point dtype")
+    return np.asarray(value, dtype=np.float64)

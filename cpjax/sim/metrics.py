@@ -1,0 +1,151 @@
+"""What a rollout is judged by, computed while it runs.
+
+A metric is a fold over the rollout's samples: `init` with the first sample, `update` with each sample (the first one
+included, at `elapsed = 0`), `finish` with the last. Nothing of the trajectory needs to be stored for it, so a million
+starts fit in memory.
+"""
+
+import math
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.numeric.trigonometry import wrap_angle
+from cpjax.pytree import Scalar, number, pytree
+from cpjax.sim.flags import STOPPED
+from cpjax.state import State
+
+
+class Sample(NamedTuple):
+    """The closed loop at one instant."""
+
+    time: jax.Array
+    """[s]."""
+    elapsed: jax.Array
+    """Since the sample before [s]; 0 at the first."""
+    state: State
+    voltage: jax.Array
+    """Applied from now on, clipped [V]."""
+    voltage_before: jax.Array
+    """Applied until now [V]: what was held, or the law of the mode until now at this state."""
+    mode: jax.Array
+    """From now on."""
+    cart_acceleration: jax.Array
+    """x'' from now on [m/s^2]."""
+    flag: jax.Array
+    """Bits of `Flag`."""
+
+
+class Fold(Protocol):
+    """A metric as a fold over samples. A pytree: its numbers may be traced."""
+
+    def init(self, sample: Sample) -> Any:
+        """The memory before the first update."""
+        ...
+
+    def update(self, memory: Any, sample: Sample) -> Any:
+        """The memory after `sample`."""
+        ...
+
+    def finish(self, memory: Any, last: Sample) -> Any:
+        """The result."""
+        ...
+
+
+@pytree
+class Metrics:
+    """The evaluation protocol's numbers for one rollout; after a sweep, an array of each.
+
+    Attributes:
+      success: settled, `hold` before the end at the latest, within the track, and not stopped by a flag.
+      settling_time: first time from which |theta| (wrapped) and |x| stay in their bands to the end [s]; inf if never.
+      cart_travel: max |x| [m].
+      effort: integral of u^2 dt [V^2 s], exact for a held voltage, by the trapezoidal rule for a continuous one.
+      voltage_variation: total variation of u [V].
+      peak_voltage: max |u|, after the clip [V].
+      peak_cart_acceleration: max |x''| at the samples [m/s^2].
+      switches: number of mode changes.
+      flag: bits of `Flag`.
+    """
+
+    success: jax.Array
+    settling_time: jax.Array
+    cart_travel: jax.Array
+    effort: jax.Array
+    voltage_variation: jax.Array
+    peak_voltage: jax.Array
+    peak_cart_acceleration: jax.Array
+    switches: jax.Array
+    flag: jax.Array
+
+
+class _Memory(NamedTuple):
+    entered: jax.Array
+    cart_travel: jax.Array
+    effort: jax.Array
+    voltage_variation: jax.Array
+    peak_voltage: jax.Array
+    peak_cart_acceleration: jax.Array
+    switches: jax.Array
+    voltage: jax.Array
+    mode: jax.Array
+
+
+@pytree
+class ProtocolMetrics:
+    """The fold that yields `Metrics`. Hard: settling time and success are piecewise constant in every parameter."""
+
+    angle_band: Scalar = number("rad", "settled: |theta| within", default=0.05, above=0.0)
+    position_band: Scalar = number("m", "settled: |x| within", default=0.05, above=0.0)
+    hold: Scalar = number("s", "success: settled at least so long before the end", default=1.0, at_least=0.0)
+    track_limit: Scalar = number("m", "success: |x| never beyond", default=math.inf, above=0.0, infinite=True)
+
+    def init(self, sample: Sample) -> _Memory:
+        nothing = jnp.zeros_like(sample.voltage)
+        return _Memory(
+            entered=jnp.full_like(sample.voltage, math.inf),
+            cart_travel=nothing,
+            effort=nothing,
+            voltage_variation=nothing,
+            peak_voltage=nothing,
+            peak_cart_acceleration=nothing,
+            switches=jnp.zeros_like(sample.mode),
+            voltage=sample.voltage,
+            mode=sample.mode,
+        )
+
+    def update(self, memory: _Memory, sample: Sample) -> _Memory:
+        travel = jnp.abs(sample.state.x)
+        inside = (jnp.abs(wrap_angle(sample.state.theta)) <= self.angle_band) & (travel <= self.position_band)
+        drift = jnp.abs(sample.voltage_before - memory.voltage)
+        jump = jnp.abs(sample.voltage - sample.voltage_before)
+        first, last = memory.voltage, sample.voltage_before
+        return _Memory(
+            entered=jnp.where(inside, jnp.minimum(memory.entered, sample.time), math.inf),
+            cart_travel=jnp.maximum(memory.cart_travel, travel),
+            effort=memory.effort + 0.5 * sample.elapsed * (first * first + last * last),
+            voltage_variation=memory.voltage_variation + drift + jump,
+            peak_voltage=jnp.maximum(memory.peak_voltage, jnp.abs(sample.voltage)),
+            peak_cart_acceleration=jnp.maximum(memory.peak_cart_acceleration, jnp.abs(sample.cart_acceleration)),
+            switches=memory.switches + (sample.mode != memory.mode).astype(memory.switches.dtype),
+            voltage=sample.voltage,
+            mode=sample.mode,
+        )
+
+    def finish(self, memory: _Memory, last: Sample) -> Metrics:
+        stopped = (last.flag & STOPPED) != 0
+        settling_time = jnp.where(stopped, math.inf, memory.entered)
+        # Both times are whole numbers of steps; half a step of slack keeps rounding out of the comparison.
+        in_time = settling_time <= last.time - self.hold + 0.5 * last.elapsed
+        return Metrics(
+            success=in_time & (memory.cart_travel <= self.track_limit),
+            settling_time=settling_time,
+            cart_travel=memory.cart_travel,
+            effort=memory.effort,
+            voltage_variation=memory.voltage_variation,
+            peak_voltage=memory.peak_voltage,
+            peak_cart_acceleration=memory.peak_cart_acceleration,
+            switches=memory.switches,
+            flag=last.flag,
+        )

@@ -1,0 +1,77 @@
+"""Many starts at once."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.controllers.protocol import Controller, Law
+from cpjax.errors import InvalidInput
+from cpjax.plant import CartPole
+from cpjax.sim.metrics import Fold
+from cpjax.sim.rollout import Clock, Switching, measure
+from cpjax.state import State, checked_start
+
+Progress = Callable[[int, int], None]
+"""Called with the number of starts done and their total."""
+
+
+def sweep(
+    plant: CartPole,
+    controller: Controller | Law,
+    starts: State,
+    *,
+    duration: float,
+    dt: float,
+    clock: Clock = "continuous",
+    control_period: float | None = None,
+    switching: Switching = "per_step",
+    integrator: str = "rk4",
+    metrics: Fold | None = None,
+    chunk: int = 4096,
+    progress: Progress | None = None,
+) -> Any:
+    """The metrics of every start; nothing of the trajectories is stored.
+
+    Args:
+      starts: a State of arrays of shape (n,), any n.
+      chunk: starts simulated together. Every chunk has this size (the last is filled up with copies), so that one
+        compilation serves all of them.
+      progress: called after each chunk.
+
+    Returns:
+      What `metrics` returns for one start, with a leading axis n; `Metrics` by default.
+
+    Raises:
+      InvalidInput: as for `rollout`, and for `chunk` below 1.
+    """
+    if isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1:
+        raise InvalidInput("chunk", chunk, "a whole number of starts, at least 1")
+    starts, _ = checked_start(starts, "starts", batched=True)
+    total = starts.x.shape[0]
+    chunk = min(chunk, total)
+
+    def run(start: State) -> Any:
+        return measure(
+            plant,
+            controller,
+            start,
+            duration=duration,
+            dt=dt,
+            clock=clock,
+            control_period=control_period,
+            switching=switching,
+            integrator=integrator,
+            metrics=metrics,
+        )
+
+    results = []
+    for begin in range(0, total, chunk):
+        members = jnp.minimum(jnp.arange(begin, begin + chunk), total - 1)
+        part = jax.vmap(run)(jax.tree.map(lambda column, members=members: column[members], starts))
+        if progress is not None:
+            jax.block_until_ready(part)
+            progress(min(begin + chunk, total), total)
+        results.append(part)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:total], *results)

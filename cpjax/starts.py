@@ -1,0 +1,47 @@
+"""The evaluation protocol's sets of starts, seeded.
+
+Random numbers come from NumPy's PCG64, not from JAX, so that a seed names the same starts in float32 and float64, on
+every backend and with every JAX release.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from cpjax.errors import InvalidInput
+from cpjax.state import HANGING, NAMES, State
+
+# Centre and half-width of each component, uniform in between.
+_SETS: Mapping[str, Mapping[str, tuple[float, float]]] = {
+    "hanging": {"x": (0.0, 0.1), "x_dot": (0.0, 0.0), "theta": (math.pi, 0.3), "theta_dot": (0.0, 0.3)},
+    "anywhere": {"x": (0.0, 0.3), "x_dot": (0.0, 0.5), "theta": (0.0, math.pi), "theta_dot": (0.0, 4.0)},
+    "rest": {name: (getattr(HANGING, name), 0.0) for name in NAMES},
+}
+
+START_SETS = tuple(_SETS)
+"""Names that `sample_starts` knows."""
+
+
+def sample_starts(name: str, count: int, *, seed: int, dtype: Any = np.float64) -> State:
+    """`count` starts drawn from a named set, as a State of NumPy arrays of shape (count,).
+
+    hanging: |x| <= 0.1 m, x_dot = 0, theta = pi +- 0.3 rad, |theta_dot| <= 0.3 rad/s.
+    anywhere: |x| <= 0.3 m, |x_dot| <= 0.5 m/s, theta anywhere on the circle, |theta_dot| <= 4 rad/s.
+    rest: exactly hanging at rest, `count` times.
+
+    A larger count with the same seed begins with the same starts.
+
+    Raises:
+      InvalidInput: an unknown set, a count below 1, or a negative seed.
+    """
+    if name not in _SETS:
+        raise InvalidInput("starts", name, "one of " + ", ".join(_SETS))
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise InvalidInput("count", count, "a whole number, at least 1")
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise InvalidInput("seed", seed, "a whole number, at least 0")
+    unit = np.random.default_rng(seed).uniform(-1.0, 1.0, size=(count, len(NAMES)))
+    columns = (centre + half * unit[:, i] for i, (centre, half) in enumerate(_SETS[name][n] for n in NAMES))
+    return State(*(column.astype(dtype) for column in columns))

@@ -1,0 +1,102 @@
+"""The state of cart and pendulum, and every convention about it.
+
+Order x, x_dot, theta, theta_dot. theta = 0 is upright, pi hangs down, and positive theta leans towards negative x: the
+pole's centre of mass is at (x - l sin(theta), l cos(theta)). Angles in rad, all else in SI units. theta is not wrapped
+while it evolves; whatever needs it modulo a turn says so.
+"""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cpjax.errors import InvalidInput
+from cpjax.pytree import Scalar, is_traced, pytree
+
+NAMES = ("x", "x_dot", "theta", "theta_dot")
+UNITS = ("m", "m/s", "rad", "rad/s")
+
+
+@pytree
+class State:
+    """Four named scalars. Under `vmap` each becomes its own array, which is the layout that vector hardware wants.
+
+    A State also carries what has its shape: a time derivative, a reference, a tangent. It is therefore not checked
+    when constructed; `rollout` and `sweep` check the start they are given.
+
+    Attributes:
+      x: cart position [m].
+      x_dot: cart velocity [m/s].
+      theta: pole angle from upright [rad].
+      theta_dot: pole angular velocity [rad/s].
+    """
+
+    x: Scalar
+    x_dot: Scalar
+    theta: Scalar
+    theta_dot: Scalar
+
+    def vector(self) -> jax.Array:
+        """The state as an array (..., 4) in the order of `NAMES`."""
+        return jnp.stack([jnp.asarray(getattr(self, name)) for name in NAMES], axis=-1)
+
+    @classmethod
+    def from_vector(cls, vector: jax.Array) -> "State":
+        """The state held in the last axis of an array (..., 4)."""
+        return cls(*(vector[..., i] for i in range(4)))
+
+
+UPRIGHT = State(0.0, 0.0, 0.0, 0.0)
+"""Balanced at rest in the middle of the track."""
+
+HANGING = State(0.0, 0.0, math.pi, 0.0)
+"""Hanging at rest in the middle of the track."""
+
+
+def checked_start(start: Any, field: str, *, batched: bool) -> tuple[State, Any]:
+    """`start` as a State of JAX arrays of one dtype, and that dtype.
+
+    Python numbers take the dtype of the arrays beside them, or JAX's default float if there are none.
+
+    Raises:
+      InvalidInput: not a State; a component that is not real, not finite, of another dtype than the rest, or not of
+        shape () (`batched=False`) or one common (n,) (`batched=True`).
+    """
+    if not isinstance(start, State):
+        raise InvalidInput(field, start, "a cpjax.State(x, x_dot, theta, theta_dot)")
+    dtypes = {}
+    for name in NAMES:
+        value = getattr(start, name)
+        path = f"{field}.{name}"
+        if isinstance(value, bool) or not (isinstance(value, (int, float)) or hasattr(value, "dtype")):
+            raise InvalidInput(path, value, "a real number or an array of them")
+        if isinstance(value, (int, float)):
+            if not math.isfinite(value):
+                raise InvalidInput(path, value, "finite")
+        else:
+            dtypes[name] = jnp.dtype(value.dtype) if is_traced(value) else jax.dtypes.canonicalize_dtype(value.dtype)
+            if dtypes[name] not in (jnp.float32, jnp.float64):
+                raise InvalidInput(path, f"array of dtype {value.dtype}", "of dtype float32 or float64")
+            if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
+                raise InvalidInput(path, value, "finite")
+    if len(set(dtypes.values())) > 1:
+        mixture = ", ".join(f"{name}: {dtype}" for name, dtype in dtypes.items())
+        raise InvalidInput(field, f"State with dtypes {mixture}", "of one dtype, float32 or float64, throughout")
+    dtype = next(iter(dtypes.values()), jnp.result_type(float))
+    values = [jnp.asarray(getattr(start, name), dtype=dtype) for name in NAMES]
+    if batched:
+        if max(v.ndim for v in values) > 1 or max(v.size for v in values) == 0:
+            raise InvalidInput(field, f"State of shapes {[v.shape for v in values]}", "arrays of one shape (n,), n >= 1")
+        try:
+            values = list(jnp.broadcast_arrays(*[jnp.atleast_1d(v) for v in values]))
+        except ValueError as problem:
+            shapes = f"State of shapes {[v.shape for v in values]}"
+            raise InvalidInput(field, shapes, "arrays of one shape (n,)") from problem
+    else:
+        for name, value in zip(NAMES, values, strict=True):
+            if value.ndim:
+                allowed = "one number; many starts go through cpjax.sweep or jax.vmap"
+                raise InvalidInput(f"{field}.{name}", f"array of shape {value.shape}", allowed)
+    return State(*values), dtype
