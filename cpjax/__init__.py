@@ -17,7 +17,7 @@ from cpjax.controllers import (
     LyapunovGate,
     StateFeedback,
 )
-from cpjax.errors import InvalidInput
+from cpjax.errors import InputError
 from cpjax.plant import CartPole, LinearModel, Motor, linearize
 from cpjax.sim.flags import Flag
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
@@ -42,7 +42,7 @@ __all__ = [
     "EnergySwingUp",
     "Flag",
     "Hybrid",
-    "InvalidInput",
+    "InputError",
     "LinearModel",
     "LyapunovGate",
     "Metrics",

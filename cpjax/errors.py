@@ -3,7 +3,7 @@
 from typing import Any
 
 
-class InvalidInput(ValueError):
+class InputError(ValueError):
     """A value from outside (an argument, a file, an option) that the library cannot use.
 
     Attributes:

@@ -5,7 +5,7 @@ Its sections are cited below; docs/paper.md lists its errors in print with the t
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -15,7 +15,7 @@ from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.gates import AngleGate
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import Law
-from cpjax.errors import InvalidInput
+from cpjax.errors import InputError
 from cpjax.numeric.trigonometry import sin_cos
 from cpjax.plant import CartPole, Motor, linearize
 from cpjax.pytree import Scalar, number, part, pytree
@@ -126,9 +126,9 @@ class CorrectedSwingUpAsVoltage:
 
 
 LAWS: Mapping[str, Callable[[CartPole], Law]] = {
-    "as-printed": lambda model: PrintedSwingUp(model),
+    "as-printed": PrintedSwingUp,
     "corrected": lambda model: EnergySwingUp(model, energy_gain=ENERGY_GAIN),
-    "corrected-as-voltage": lambda model: CorrectedSwingUpAsVoltage(model),
+    "corrected-as-voltage": CorrectedSwingUpAsVoltage,
     "corrected-centred": lambda model: EnergySwingUp(model, energy_gain=5.0, cart_stiffness=4.0, cart_damping=2.0),
 }
 """Swing-up laws by name, given their model of the plant. All but the last have the paper's k = 0.2; the last is no
@@ -139,7 +139,7 @@ def computed_gain(design: Design, plant: CartPole) -> np.ndarray:
     """The gain (1, 4) that the paper's poles or weights really give on `plant`.
 
     Raises:
-      InvalidInput: `design` is not one of the two.
+      InputError: `design` is not one of the two.
     """
     _check_choice("design", design, get_args(Design))
     A, B = (np.asarray(part_, dtype=float) for part_ in linearize(plant))
@@ -163,7 +163,7 @@ def regulator(design: Design, gains: Gains, plant: CartPole) -> StateFeedback:
     """The linear law of section IV with its gain as printed, or as computed from the printed poles or weights.
 
     Raises:
-      InvalidInput: `design` or `gains` is not one of its two words.
+      InputError: `design` or `gains` is not one of its two words.
     """
     _check_choice("design", design, get_args(Design))
     _check_choice("gains", gains, get_args(Gains))
@@ -178,13 +178,13 @@ def controller(law: str, design: Design, plant: CartPole, gains: Gains = "printe
       plant: the law's model, and what `gains="computed"` are computed for.
 
     Raises:
-      InvalidInput: an unknown name.
+      InputError: an unknown name.
     """
     _check_choice("law", law, LAWS)
     return Hybrid(LAWS[law](plant), regulator(design, gains, plant), AngleGate(SWITCH_ANGLE))
 
 
-def _check_choice(field: str, value: object, options: object) -> None:
-    names = tuple(options)  # type: ignore[call-overload]  # any iterable of names
+def _check_choice(field: str, value: object, options: Iterable[str]) -> None:
+    names = tuple(options)
     if value not in names:
-        raise InvalidInput(field, value, "one of " + ", ".join(names))
+        raise InputError(field, value, "one of " + ", ".join(names))

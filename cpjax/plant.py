@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cpjax.errors import InvalidInput
+from cpjax.errors import InputError
 from cpjax.numeric.trigonometry import sin_cos
 from cpjax.pytree import Scalar, is_traced, number, part, pytree
 from cpjax.state import HANGING, UPRIGHT, State
@@ -206,12 +206,12 @@ def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | Stat
       equilibrium: "upright", "hanging", or a State at rest in which nothing accelerates (the cart may stand anywhere).
 
     Raises:
-      InvalidInput: `equilibrium` is another word, or a concrete State that is none.
+      InputError: `equilibrium` is another word, or a concrete State that is none.
     """
     named = {"upright": UPRIGHT, "hanging": HANGING}
     if isinstance(equilibrium, str):
         if equilibrium not in named:
-            raise InvalidInput("equilibrium", equilibrium, "upright, hanging or a State")
+            raise InputError("equilibrium", equilibrium, "upright, hanging or a State")
         equilibrium = named[equilibrium]
 
     def field(vector: jax.Array, voltage: jax.Array) -> jax.Array:
@@ -222,6 +222,6 @@ def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | Stat
     voltage = jnp.zeros((), dtype=dtype)
     drift = field(vector, voltage)
     if not is_traced(drift) and float(np.max(np.abs(np.asarray(drift)))) > 1e-4:
-        raise InvalidInput("equilibrium", equilibrium, "a state at rest in which nothing accelerates")
+        raise InputError("equilibrium", equilibrium, "a state at rest in which nothing accelerates")
     A, B = jax.jacfwd(field, argnums=(0, 1))(vector, voltage)
     return LinearModel(A, B[:, None])

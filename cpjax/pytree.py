@@ -2,8 +2,8 @@
 
 A class decorated with `pytree` is an immutable dataclass whose numbers are JAX leaves and whose choices (`choice`) are
 static. What a user constructs is checked against the declared ranges; what JAX rebuilds is not, because JAX fills the
-leaves with tracers, `None`, axis numbers and zeros of an optimiser. The same declarations feed the command line's options,
-the files' keys and the documentation, so that a parameter is described in one place.
+leaves with tracers, `None`, axis numbers and zeros of an optimiser. The same declarations feed the command line's
+options, the files' keys and the documentation, so that a parameter is described in one place.
 """
 
 import dataclasses
@@ -14,9 +14,12 @@ from typing import Any, TypeAlias, TypeVar, dataclass_transform
 import jax
 import numpy as np
 
-from cpjax.errors import InvalidInput
+from cpjax.errors import InputError
 
-Scalar: TypeAlias = jax.Array | float
+Array: TypeAlias = jax.Array | np.ndarray[Any, Any]
+"""What JAX takes as an array. Classes hold NumPy arrays until a rollout casts them: no backend starts before."""
+
+Scalar: TypeAlias = Array | float
 """One real number: a Python float, or an array of shape () that JAX may trace. Batches appear only under `vmap`."""
 
 T = TypeVar("T")
@@ -53,7 +56,7 @@ class Number:
             value = float(value)
         numbers = _concrete_reals(name, value, self.allowed())
         if numbers is not None and not self._holds(numbers):
-            raise InvalidInput(name, value, self.allowed())
+            raise InputError(name, value, self.allowed())
         return value
 
     def _holds(self, v: np.ndarray) -> bool:
@@ -81,20 +84,20 @@ class Matrix:
             try:
                 value = np.asarray(value, dtype=float)
             except (TypeError, ValueError) as problem:
-                raise InvalidInput(name, value, self.allowed()) from problem
+                raise InputError(name, value, self.allowed()) from problem
         if not hasattr(value, "shape"):
-            raise InvalidInput(name, value, self.allowed())
+            raise InputError(name, value, self.allowed())
         if self.shape[0] == 1 and value.shape == self.shape[1:]:
             value = value.reshape(self.shape)  # a plain row is welcome where a one-row matrix is meant
         if value.shape[-len(self.shape) :] != self.shape:
-            raise InvalidInput(name, f"array of shape {value.shape}", self.allowed())
+            raise InputError(name, f"array of shape {value.shape}", self.allowed())
         numbers = _concrete_reals(name, value, self.allowed())
         if numbers is None:
             return value
         scale = np.max(np.abs(numbers), initial=0.0)
         skewed = self.symmetric and not np.allclose(numbers, np.swapaxes(numbers, -1, -2), rtol=0, atol=1e-6 * scale)
         if not np.all(np.isfinite(numbers)) or skewed:
-            raise InvalidInput(name, value, self.allowed())
+            raise InputError(name, value, self.allowed())
         return value
 
 
@@ -108,7 +111,7 @@ class Part:
     def normalise(self, name: str, value: Any) -> Any:
         missing = [attribute for attribute in self.needs if not hasattr(value, attribute)]
         if missing:
-            raise InvalidInput(name, value, f"{self.help} (with {', '.join(self.needs)})")
+            raise InputError(name, value, f"{self.help} (with {', '.join(self.needs)})")
         return value
 
 
@@ -121,7 +124,7 @@ class Choice:
 
     def normalise(self, name: str, value: Any) -> Any:
         if value not in self.options:
-            raise InvalidInput(name, value, "one of " + ", ".join(map(str, self.options)))
+            raise InputError(name, value, "one of " + ", ".join(map(str, self.options)))
         return value
 
 
@@ -161,7 +164,7 @@ def pytree(cls: type[T]) -> type[T]:
     """Class decorator: frozen dataclass, registered with JAX, checked when a user constructs it.
 
     Raises (from the constructor):
-      InvalidInput: a concrete value outside its declared range, not a number, or of the wrong shape or dtype.
+      InputError: a concrete value outside its declared range, not a number, or of the wrong shape or dtype.
     """
     checked = hasattr(cls, "__post_init__")
 
@@ -230,5 +233,5 @@ def _concrete_reals(name: str, value: Any, allowed: str) -> np.ndarray | None:
     dtype = getattr(value, "dtype", None)
     if dtype is None or not jax.numpy.issubdtype(dtype, np.floating):
         kind = f" of dtype {dtype}" if dtype is not None else ""
-        raise InvalidInput(name, f"{value}{kind}" if kind else value, f"{allowed}, of a floating-point dtype")
+        raise InputError(name, f"{value}{kind}" if kind else value, f"{allowed}, of a floating-point dtype")
     return np.asarray(value, dtype=np.float64)

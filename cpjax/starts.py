@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from cpjax.errors import InvalidInput
+from cpjax.errors import InputError
 from cpjax.state import HANGING, NAMES, State
 
 # Centre and half-width of each component, uniform in between.
@@ -34,14 +34,14 @@ def sample_starts(name: str, count: int, *, seed: int, dtype: Any = np.float64) 
     A larger count with the same seed begins with the same starts.
 
     Raises:
-      InvalidInput: an unknown set, a count below 1, or a negative seed.
+      InputError: an unknown set, a count below 1, or a negative seed.
     """
     if name not in _SETS:
-        raise InvalidInput("starts", name, "one of " + ", ".join(_SETS))
+        raise InputError("starts", name, "one of " + ", ".join(_SETS))
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise InvalidInput("count", count, "a whole number, at least 1")
+        raise InputError("count", count, "a whole number, at least 1")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise InvalidInput("seed", seed, "a whole number, at least 0")
+        raise InputError("seed", seed, "a whole number, at least 0")
     unit = np.random.default_rng(seed).uniform(-1.0, 1.0, size=(count, len(NAMES)))
     columns = (centre + half * unit[:, i] for i, (centre, half) in enumerate(_SETS[name][n] for n in NAMES))
     return State(*(column.astype(dtype) for column in columns))

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cpjax.errors import InvalidInput
+from cpjax.errors import InputError
 from cpjax.pytree import Scalar, is_traced, pytree
 
 NAMES = ("x", "x_dot", "theta", "theta_dot")
@@ -61,42 +61,42 @@ def checked_start(start: Any, field: str, *, batched: bool) -> tuple[State, Any]
     Python numbers take the dtype of the arrays beside them, or JAX's default float if there are none.
 
     Raises:
-      InvalidInput: not a State; a component that is not real, not finite, of another dtype than the rest, or not of
+      InputError: not a State; a component that is not real, not finite, of another dtype than the rest, or not of
         shape () (`batched=False`) or one common (n,) (`batched=True`).
     """
     if not isinstance(start, State):
-        raise InvalidInput(field, start, "a cpjax.State(x, x_dot, theta, theta_dot)")
+        raise InputError(field, start, "a cpjax.State(x, x_dot, theta, theta_dot)")
     dtypes = {}
     for name in NAMES:
         value = getattr(start, name)
         path = f"{field}.{name}"
         if isinstance(value, bool) or not (isinstance(value, (int, float)) or hasattr(value, "dtype")):
-            raise InvalidInput(path, value, "a real number or an array of them")
+            raise InputError(path, value, "a real number or an array of them")
         if isinstance(value, (int, float)):
             if not math.isfinite(value):
-                raise InvalidInput(path, value, "finite")
+                raise InputError(path, value, "finite")
         else:
             dtypes[name] = jnp.dtype(value.dtype) if is_traced(value) else jax.dtypes.canonicalize_dtype(value.dtype)
             if dtypes[name] not in (jnp.float32, jnp.float64):
-                raise InvalidInput(path, f"array of dtype {value.dtype}", "of dtype float32 or float64")
+                raise InputError(path, f"array of dtype {value.dtype}", "of dtype float32 or float64")
             if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
-                raise InvalidInput(path, value, "finite")
+                raise InputError(path, value, "finite")
     if len(set(dtypes.values())) > 1:
         mixture = ", ".join(f"{name}: {dtype}" for name, dtype in dtypes.items())
-        raise InvalidInput(field, f"State with dtypes {mixture}", "of one dtype, float32 or float64, throughout")
+        raise InputError(field, f"State with dtypes {mixture}", "of one dtype, float32 or float64, throughout")
     dtype = next(iter(dtypes.values()), jnp.result_type(float))
     values = [jnp.asarray(getattr(start, name), dtype=dtype) for name in NAMES]
     if batched:
-        if max(v.ndim for v in values) > 1 or max(v.size for v in values) == 0:
-            raise InvalidInput(field, f"State of shapes {[v.shape for v in values]}", "arrays of one shape (n,), n >= 1")
+        shapes = f"State of shapes {[v.shape for v in values]}"
+        if max(v.ndim for v in values) > 1 or min(v.size for v in values) == 0:
+            raise InputError(field, shapes, "arrays of one shape (n,), n at least 1")
         try:
             values = list(jnp.broadcast_arrays(*[jnp.atleast_1d(v) for v in values]))
         except ValueError as problem:
-            shapes = f"State of shapes {[v.shape for v in values]}"
-            raise InvalidInput(field, shapes, "arrays of one shape (n,)") from problem
+            raise InputError(field, shapes, "arrays of one shape (n,), n at least 1") from problem
     else:
         for name, value in zip(NAMES, values, strict=True):
             if value.ndim:
                 allowed = "one number; many starts go through cpjax.sweep or jax.vmap"
-                raise InvalidInput(f"{field}.{name}", f"array of shape {value.shape}", allowed)
+                raise InputError(f"{field}.{name}", f"array of shape {value.shape}", allowed)
     return State(*values), dtype

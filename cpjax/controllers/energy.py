@@ -8,6 +8,8 @@ so a = -k E theta' cos(theta) drives E to zero from either side. The law asks fo
 yields it follows from its own model of the plant, which need not be the true one.
 """
 
+import jax.numpy as jnp
+
 from cpjax.numeric.trigonometry import sin_cos
 from cpjax.plant import CartPole
 from cpjax.pytree import Scalar, number, part, pytree
@@ -53,5 +55,5 @@ class EnergySwingUp:
         weight = self.model.pole_mass * self.model.gravity * self.model.pole_length
         above_rest = 0.5 * self.model.pivot_inertia * state.theta_dot * state.theta_dot / weight + (1.0 + cos)
         room = 1.0 - above_rest / (0.5 * self.kick_radius * self.kick_radius)
-        inside = 0.5 * (room + abs(room))  # max(room, 0); its kink at 0 vanishes in the cube
+        inside = jnp.maximum(room, 0.0)  # its kink vanishes in the cube
         return inside * inside * inside

@@ -1,9 +1,7 @@
 """Linear state feedback."""
 
-import jax
-
 from cpjax.numeric.trigonometry import wrap_angle
-from cpjax.pytree import Scalar, matrix, part, pytree
+from cpjax.pytree import Array, Scalar, matrix, part, pytree
 from cpjax.state import NAMES, UPRIGHT, State
 
 
@@ -14,7 +12,7 @@ class StateFeedback:
     A plain sequence of four gains is accepted for K.
     """
 
-    K: jax.Array = matrix((1, 4), "V per unit of state", "gain, u = -K (s - s_ref)")
+    K: Array = matrix((1, 4), "V per unit of state", "gain, u = -K (s - s_ref)")
     reference: State = part("the state to hold, a State", *NAMES, default=UPRIGHT)
 
     def voltage(self, state: State) -> Scalar:

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from cpjax.controllers.protocol import REGULATE
-from cpjax.errors import InvalidInput
+from cpjax.errors import InputError
 from cpjax.numeric.trigonometry import sin_cos, wrap_angle
-from cpjax.pytree import Scalar, is_traced, matrix, number, pytree
+from cpjax.pytree import Array, Scalar, is_traced, matrix, number, pytree
 from cpjax.state import State
 
 
@@ -71,7 +71,7 @@ class AngleRateGate:
 class LyapunovGate:
     """Open in a level set of s' P s, with theta wrapped: margin = level (1 + hysteresis, on the way out) - s' P s."""
 
-    P: jax.Array = matrix((4, 4), "per product of states", "symmetric weight, such as LQR's P", symmetric=True)
+    P: Array = matrix((4, 4), "per product of states", "symmetric weight, such as LQR's P", symmetric=True)
     level: Scalar = number("1", "s' P s up to which the gate is open", above=0.0)
     hysteresis: Scalar = number("1", "relative widening of the way out", default=0.0, at_least=0.0)
 
@@ -94,5 +94,4 @@ def _check_widened_angle(gate: str, half_angle: Any, hysteresis: Any) -> None:
     widest = np.max(np.asarray(half_angle) * (1.0 + np.asarray(hysteresis)))
     if widest > math.pi * (1 + 1e-6):
         allowed = f"small enough that half_angle * (1 + hysteresis) is at most pi (half_angle = {half_angle} rad)"
-        raise InvalidInput(f"{gate}.hysteresis", hysteresis, allowed)
-
+        raise InputError(f"{gate}.hysteresis", hysteresis, allowed)

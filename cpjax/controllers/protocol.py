@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 
-from cpjax.errors import InvalidInput
+from cpjax.errors import InputError
 from cpjax.pytree import Scalar, part, pytree
 from cpjax.state import State
 
@@ -66,10 +66,10 @@ def as_controller(controller: Controller | Law) -> Controller:
     """`controller` itself, or a bare law as a controller.
 
     Raises:
-      InvalidInput: it is neither.
+      InputError: it is neither.
     """
     if isinstance(controller, Controller):
         return controller
     if isinstance(controller, Law):
         return SingleLaw(controller)
-    raise InvalidInput("controller", controller, "a controller such as cpjax.Hybrid, or a law with voltage(state)")
+    raise InputError("controller", controller, "a controller such as cpjax.Hybrid, or a law with voltage(state)")

@@ -3,14 +3,14 @@
 import math
 from statistics import NormalDist
 
-from cpjax.errors import InvalidInput
+from cpjax.errors import InputError
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Two-sided Wilson score interval of a proportion (Wilson, 1927): `(low, high)` within [0, 1].
 
     Raises:
-      InvalidInput: `trials` below 1, or `successes` outside 0..trials.
+      InputError: `trials` below 1, or `successes` outside 0..trials.
     """
     _check_counts(successes, trials)
     z = NormalDist().inv_cdf(0.5 + confidence / 2)
@@ -38,6 +38,6 @@ def two_proportion_p_value(successes_a: int, trials_a: int, successes_b: int, tr
 
 def _check_counts(successes: int, trials: int) -> None:
     if trials < 1:
-        raise InvalidInput("trials", trials, "a whole number, at least 1")
+        raise InputError("trials", trials, "a whole number, at least 1")
     if not 0 <= successes <= trials:
-        raise InvalidInput("successes", successes, f"a whole number from 0 to trials = {trials}")
+        raise InputError("successes", successes, f"a whole number from 0 to trials = {trials}")

@@ -5,6 +5,7 @@ routine that it does not vectorise well; one shared range reduction and two shor
 """
 
 import math
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +37,9 @@ _SIN_32 = (-1.6666654611e-1, 8.3321608736e-3, -1.9515295891e-4)
 _COS_32 = (4.166664568298827e-2, -1.388731625493765e-3, 2.443315711809948e-5)
 
 
+_Pair: TypeAlias = tuple[jax.Array, jax.Array]
+
+
 @jax.custom_jvp
 def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
     """Sine and cosine of `angle` [rad], any shape, float32 or float64; accurate to 2 ulp of 1 for |angle| <= 1e4.
@@ -44,9 +48,7 @@ def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
     """
     angle = jnp.asarray(angle)
     wide = angle.dtype == jnp.float64
-    half_pi, sin_terms, cos_terms = (
-        (_HALF_PI_64, _SIN_64, _COS_64) if wide else (_HALF_PI_32, _SIN_32, _COS_32)
-    )
+    half_pi, sin_terms, cos_terms = (_HALF_PI_64, _SIN_64, _COS_64) if wide else (_HALF_PI_32, _SIN_32, _COS_32)
     turns = lax.round(angle * (2.0 / math.pi), lax.RoundingMethod.TO_NEAREST_EVEN)
     r = ((angle - turns * half_pi[0]) - turns * half_pi[1]) - turns * half_pi[2]
     z = r * r
@@ -59,7 +61,7 @@ def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
 
 
 @sin_cos.defjvp
-def _sin_cos_jvp(primals: tuple[Scalar], tangents: tuple[jax.Array]) -> tuple[tuple[jax.Array, ...], ...]:
+def _sin_cos_jvp(primals: tuple[Scalar], tangents: tuple[jax.Array]) -> tuple[_Pair, _Pair]:
     (angle,), (tangent,) = primals, tangents
     sin, cos = sin_cos(angle)
     return (sin, cos), (cos * tangent, -sin * tangent)

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from cpjax.controllers.protocol import Controller, Law, as_controller
-from cpjax.errors import InvalidInput
-from cpjax.plant import CartPole
+from cpjax.errors import InputError
 from cpjax.numeric.trigonometry import sin_cos
+from cpjax.plant import CartPole
 from cpjax.pytree import cast, is_traced, pytree
 from cpjax.sim.flags import CHATTER_LENGTH, RUNAWAY_LIMIT, STOPPED, Flag
 from cpjax.sim.integrators import INTEGRATORS
@@ -82,7 +82,7 @@ def rollout(
       metrics: a fold over all steps; by default `ProtocolMetrics()`.
 
     Raises:
-      InvalidInput: bad arguments, named; never because of what the simulation does (see `Trajectory.flag`).
+      InputError: bad arguments, named; never because of what the simulation does (see `Trajectory.flag`).
     """
     settings = _check_settings(duration, dt, clock, control_period, switching, integrator, save_every)
     start, dtype = checked_start(start, "start", batched=False)
@@ -218,7 +218,8 @@ def _advance(plant: CartPole, controller: Controller, loop: _Loop, dt: jax.Array
     else:
         after = step_held(plant, method, loop.state, loop.voltage, dt)
     finite = jnp.isfinite(after.x + after.x_dot + after.theta + after.theta_dot)
-    bounded = jnp.maximum(jnp.maximum(jnp.abs(after.x), jnp.abs(after.x_dot)), jnp.abs(after.theta_dot)) <= RUNAWAY_LIMIT
+    fastest = jnp.maximum(jnp.abs(after.x_dot), jnp.abs(after.theta_dot))
+    bounded = jnp.maximum(jnp.abs(after.x), fastest) <= RUNAWAY_LIMIT
     flag = loop.flag | jnp.where(finite, jnp.where(bounded, 0, int(Flag.RUNAWAY)), int(Flag.NON_FINITE))
     stopped = (flag & STOPPED) != 0
     # The branch not taken contributes nothing to the derivative: a stopped run no longer depends on anything new.
@@ -230,7 +231,7 @@ def _cast_arguments(
     plant: Any, controller: Any, fold: Fold | None, dt: float, dtype: Any
 ) -> tuple[CartPole, Controller, Fold, jax.Array]:
     if not isinstance(plant, CartPole):
-        raise InvalidInput("plant", plant, "a cpjax.CartPole")
+        raise InputError("plant", plant, "a cpjax.CartPole")
     fold = ProtocolMetrics() if fold is None else fold
     return (
         cast(plant, dtype),
@@ -252,40 +253,40 @@ def _check_settings(
     dt = _positive_seconds("dt", dt)
     duration = _positive_seconds("duration", duration)
     if dt > duration:
-        raise InvalidInput("dt", dt, f"at most the duration, {duration:g} s")
+        raise InputError("dt", dt, f"at most the duration, {duration:g} s")
     steps = _whole_steps("duration", duration, dt)
     if clock not in ("continuous", "sampled"):
-        raise InvalidInput("clock", clock, "continuous or sampled")
+        raise InputError("clock", clock, "continuous or sampled")
     if switching != "per_step":
-        raise InvalidInput("switching", switching, "per_step")
+        raise InputError("switching", switching, "per_step")
     if integrator not in INTEGRATORS:
-        raise InvalidInput("integrator", integrator, "one of " + ", ".join(INTEGRATORS))
+        raise InputError("integrator", integrator, "one of " + ", ".join(INTEGRATORS))
     steps_per_control = 1
     if control_period is not None:
         if clock != "sampled":
-            raise InvalidInput("control_period", control_period, "absent unless clock is sampled")
+            raise InputError("control_period", control_period, "absent unless clock is sampled")
         period = _positive_seconds("control_period", control_period)
         if period < dt * (1 - 1e-6):
-            raise InvalidInput("control_period", control_period, f"at least one step, dt = {dt:g} s")
+            raise InputError("control_period", control_period, f"at least one step, dt = {dt:g} s")
         steps_per_control = _whole_steps("control_period", period, dt)
     if save_every is not None:
         if isinstance(save_every, bool) or not isinstance(save_every, int) or save_every < 1:
-            raise InvalidInput("save_every", save_every, "a whole number of steps, at least 1")
+            raise InputError("save_every", save_every, "a whole number of steps, at least 1")
         if steps % save_every:
-            raise InvalidInput("save_every", save_every, f"a divisor of the number of steps, {steps}")
+            raise InputError("save_every", save_every, f"a divisor of the number of steps, {steps}")
     return _Settings(steps, save_every, clock, steps_per_control, integrator)
 
 
 def _positive_seconds(field: str, value: Any) -> float:
     allowed = "a finite number above 0 [s], known when the rollout is compiled"
     if is_traced(value) or isinstance(value, bool):
-        raise InvalidInput(field, value, allowed)
+        raise InputError(field, value, allowed)
     try:
         seconds = float(value)
     except (TypeError, ValueError) as problem:
-        raise InvalidInput(field, value, allowed) from problem
+        raise InputError(field, value, allowed) from problem
     if not (math.isfinite(seconds) and seconds > 0):
-        raise InvalidInput(field, value, allowed)
+        raise InputError(field, value, allowed)
     return seconds
 
 
@@ -293,8 +294,7 @@ def _whole_steps(field: str, seconds: float, dt: float) -> int:
     """How many steps of `dt` make `seconds`; decimal fractions such as 0.3 / 0.1 count as whole."""
     steps = round(seconds / dt)
     if abs(seconds / dt - steps) > 1e-6 * steps:
-        raise InvalidInput(field, seconds, f"a whole multiple of dt = {dt:g} s")
+        raise InputError(field, seconds, f"a whole multiple of dt = {dt:g} s")
     if steps >= 2**31:
-        raise InvalidInput(field, seconds, f"fewer than 2^31 steps of dt = {dt:g} s")
+        raise InputError(field, seconds, f"fewer than 2^31 steps of dt = {dt:g} s")
     return steps
-

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from cpjax.controllers.protocol import Controller, Law
-from cpjax.errors import InvalidInput
+from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.sim.metrics import Fold
 from cpjax.sim.rollout import Clock, Switching, measure
@@ -44,12 +44,12 @@ def sweep(
       What `metrics` returns for one start, with a leading axis n; `Metrics` by default.
 
     Raises:
-      InvalidInput: as for `rollout`, and for `chunk` below 1.
+      InputError: as for `rollout`, and for `chunk` below 1.
     """
     if isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1:
-        raise InvalidInput("chunk", chunk, "a whole number of starts, at least 1")
+        raise InputError("chunk", chunk, "a whole number of starts, at least 1")
     starts, _ = checked_start(starts, "starts", batched=True)
-    total = starts.x.shape[0]
+    total = jnp.shape(starts.x)[0]
     chunk = min(chunk, total)
 
     def run(start: State) -> Any:
@@ -71,7 +71,7 @@ def sweep(
         members = jnp.minimum(jnp.arange(begin, begin + chunk), total - 1)
         part = jax.vmap(run)(jax.tree.map(lambda column, members=members: column[members], starts))
         if progress is not None:
-            jax.block_until_ready(part)
+            jax.block_until_ready(part)  # type: ignore[no-untyped-call]  # untyped in JAX
             progress(min(begin + chunk, total), total)
         results.append(part)
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:total], *results)
