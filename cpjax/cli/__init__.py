@@ -1,0 +1,63 @@
+"""The command line. Each command is a file here: it declares options, calls the library, prints and writes."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from cpjax.errors import InputError
+
+EXIT_CODES = """\
+exit codes:
+  0    done (swingup: and the pendulum settled)
+  1    swingup: the rollout ran, but the pendulum did not settle
+  2    bad input: one line on standard error names the field, the value and what is allowed
+  130  interrupted
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message}\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command and returns its exit code; see `EXIT_CODES`."""
+    from cpjax.cli import report, reproduce, swingup
+
+    parser = _Parser(
+        prog="cpjax",
+        description="A motor-driven cart-pole: swing-up, catch, and the numbers behind them.",
+        epilog=EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=_version())
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
+    for module in (swingup, reproduce, report):
+        module.add_command(commands)
+    try:
+        options = parser.parse_args(arguments)
+    except SystemExit as stop:  # argparse ends the process itself; as a function, main returns
+        return int(stop.code or 0)
+
+    import jax
+
+    # The protocol's figures are float64. Set here, in the application: the library never touches JAX's settings.
+    jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # untyped in JAX
+    try:
+        code: int = options.run(options)
+        return code
+    except InputError as problem:
+        print(f"cpjax {options.command}: error: {problem}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"cpjax {options.command}: interrupted; what was saved so far is kept", file=sys.stderr)
+        return 130
+
+
+def _version() -> str:
+    from cpjax import __version__
+
+    return f"cpjax {__version__}"

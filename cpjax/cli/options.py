@@ -1,0 +1,240 @@
+"""Options that a flag or a TOML file can set, and what is built from them.
+
+One declaration makes both: section "plant", key "cart_mass" is `--cart-mass` on the command line and `cart_mass` under
+`[plant]` in the file given with `--config`. A flag wins over the file. Names, units and ranges of physical parameters
+come from the fields of the classes themselves.
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from cpjax import io, paper
+from cpjax.controllers import AngleGate, AngleRateGate, EnergySwingUp, Hybrid, LyapunovGate, StateFeedback
+from cpjax.controllers.gates import Gate
+from cpjax.controllers.protocol import Controller
+from cpjax.errors import InputError
+from cpjax.plant import CartPole, Motor
+from cpjax.pytree import Number, rules
+from cpjax.sim.integrators import INTEGRATORS
+from cpjax.starts import START_SETS, sample_starts
+from cpjax.state import NAMES, UNITS, State
+
+Sections: TypeAlias = Mapping[str, Mapping[str, Any]]
+"""Values given by the user, by section and key. What was not given is absent."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """One setting; `flag` where it differs from the key."""
+
+    section: str
+    key: str
+    help: str
+    type: type = str
+    choices: Sequence[str] | None = None
+    count: int | None = None
+    flag: str | None = None
+
+    @property
+    def name(self) -> str:
+        """The flag, with its dashes."""
+        return "--" + (self.flag or self.key.replace("_", "-"))
+
+
+def _numbers_of(section: str, cls: type, keys: Sequence[str] | None = None) -> list[Option]:
+    chosen = {k: r for k, r in rules(cls).items() if isinstance(r, Number) and (keys is None or k in keys)}
+    return [Option(section, key, f"{rule.help} [{rule.unit}]", float) for key, rule in chosen.items()]
+
+
+_PLANTS = ", ".join(paper.PLANTS)
+_GATES: Mapping[str, type[AngleGate | AngleRateGate | LyapunovGate]] = {
+    "angle": AngleGate,
+    "angle-rate": AngleRateGate,
+    "lyapunov": LyapunovGate,
+}
+
+PLANT_OPTIONS = [
+    Option("plant", "base", f"{_PLANTS}, or a file; other plant options change it (default appendix)", flag="plant"),
+    *_numbers_of("plant", CartPole),
+    *_numbers_of("plant", Motor),
+]
+
+CONTROLLER_OPTIONS = [
+    Option("controller", "file", "a controller saved by cpjax, instead of all options below", flag="controller"),
+    Option("controller", "law", "swing-up law (default corrected-centred)", choices=tuple(paper.LAWS)),
+    Option("controller", "design", "regulator (default placement)", choices=("placement", "lqr")),
+    Option(
+        "controller",
+        "gains",
+        "the paper's, or computed for the plant (default printed)",
+        choices=("printed", "computed"),
+    ),
+    Option("controller", "K", "the regulator's gain itself, instead of design and gains", float, count=4, flag="gain"),
+    *_numbers_of("controller", EnergySwingUp),
+    Option("controller", "gate", "where the regulator takes over (default angle)", choices=tuple(_GATES)),
+    *_numbers_of("controller", AngleRateGate),
+    *_numbers_of("controller", LyapunovGate, ["level"]),
+    Option("controller", "reference_x", "where the regulator holds the cart [m]", float),
+]
+
+START_OPTIONS = [
+    Option("start", "set", "draw the start from this set with --seed (default rest)", choices=START_SETS, flag="start"),
+    *(Option("start", n, f"start at this {n} [{u}] instead", float) for n, u in zip(NAMES, UNITS, strict=True)),
+]
+
+RUN_OPTIONS = [
+    Option("run", "duration", "length of the rollout [s] (default 20)", float),
+    Option("run", "dt", "integration step [s] (default 0.002)", float),
+    Option("run", "clock", "when the law is evaluated (default sampled)", choices=("sampled", "continuous")),
+    Option("run", "control_period", "of the sampled clock [s] (default one step)", float),
+    Option("run", "integrator", "(default rk4)", choices=tuple(INTEGRATORS)),
+]
+
+EVALUATION_OPTIONS = [
+    Option("evaluation", "starts", "set of starts (default hanging)", choices=START_SETS),
+    Option("evaluation", "count", "number of starts (default 4096)", int),
+    Option("evaluation", "duration", "length of each rollout [s] (default 20)", float),
+    Option("evaluation", "dt", "integration step and control period [s] (default 0.002)", float),
+]
+
+
+def add_options(parser: argparse.ArgumentParser, options: Sequence[Option], *, out: str) -> None:
+    """Declares the options, grouped by section, and those that every command has."""
+    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file, in sections; flags win")
+    parser.add_argument("--seed", type=int, default=1, help="of everything random (default 1)")
+    parser.add_argument("--out", type=Path, default=Path(out), help=f"folder for what is written (default {out})")
+    for section in dict.fromkeys(option.section for option in options):
+        group = parser.add_argument_group(f"[{section}]")
+        for option in (o for o in options if o.section == section):
+            group.add_argument(
+                option.name,
+                dest=f"{option.section}.{option.key}",
+                type=option.type,
+                choices=option.choices,
+                nargs=option.count,
+                metavar=None if option.choices else option.key.upper(),
+                help=option.help,
+            )
+
+
+def resolve(given: argparse.Namespace, options: Sequence[Option]) -> Sections:
+    """What the file and the flags say together.
+
+    Raises:
+      InputError: a file that is no TOML, or a section, key or value in it that no option has.
+    """
+    sections: dict[str, dict[str, Any]] = {option.section: {} for option in options}
+    if given.config is not None:
+        _read_config(given.config, options, sections)
+    for option in options:
+        value = getattr(given, f"{option.section}.{option.key}")
+        if value is not None:
+            sections[option.section][option.key] = value
+    return sections
+
+
+def _read_config(path: Path, options: Sequence[Option], sections: dict[str, dict[str, Any]]) -> None:
+    if path.suffix.lower() != ".toml":
+        raise InputError("--config", str(path), "a TOML file, with a name that ends in .toml")
+    known = {(option.section, option.key): option for option in options}
+    for section, table in io.read_table(path).items():
+        if section not in sections:
+            raise InputError(f"{path}: section", section, "one of " + ", ".join(sections))
+        if not isinstance(table, dict):
+            raise InputError(f"{path}: {section}", table, "a section, written [" + section + "]")
+        for key, value in table.items():
+            option = known.get((section, key))
+            if option is None:
+                keys = ", ".join(k for s, k in known if s == section)
+                raise InputError(f"{path}: [{section}] key", key, f"one of {keys}")
+            sections[section][key] = _checked_value(f"{path}: [{section}] {key}", value, option)
+
+
+def _checked_value(field: str, value: Any, option: Option) -> Any:
+    """A value from a file, held to what the flag would have accepted."""
+    kinds = {float: ((int, float), "a number"), int: ((int,), "a whole number"), str: ((str,), "a text")}
+    python_types, words = kinds[option.type]
+    several = option.count is not None
+    if several and not (isinstance(value, list) and len(value) == option.count):
+        raise InputError(field, value, f"a list of {option.count} values")
+    for one in value if several else [value]:
+        if isinstance(one, bool) or not isinstance(one, python_types):
+            raise InputError(field, value, words)
+        if option.choices is not None and one not in option.choices:
+            raise InputError(field, value, "one of " + ", ".join(option.choices))
+    return value
+
+
+def build_plant(given: Mapping[str, Any]) -> CartPole:
+    """The base plant with the given parameters changed."""
+    changes = dict(given)
+    base = changes.pop("base", "appendix")
+    if base in paper.PLANTS:
+        plant = paper.PLANTS[base]()
+    else:
+        if Path(base).suffix.lower() not in (".json", ".toml"):
+            raise InputError("plant", base, f"{_PLANTS}, or a file that ends in .json or .toml")
+        plant = io.load(base)
+        if not isinstance(plant, CartPole):
+            raise InputError("plant", base, "a file that holds a CartPole")
+    motor = {key: changes.pop(key) for key in list(changes) if key in rules(Motor)}
+    return dataclasses.replace(plant, **changes, motor=dataclasses.replace(plant.motor, **motor))
+
+
+def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
+    """The hybrid controller that the options describe, with `plant` as its law's model; or the one in the file."""
+    changes = dict(given)
+    file = changes.pop("file", None)
+    if file is not None:
+        if changes:
+            raise InputError("controller", file, "alone, without " + ", ".join(changes))
+        controller = io.load(file)
+        if not isinstance(controller, Controller):
+            raise InputError("controller", file, "a file that holds a controller")
+        return controller
+    name = changes.pop("law", "corrected-centred")
+    law = paper.LAWS[name](plant)
+    law_changes = {key: changes.pop(key) for key in list(changes) if key in rules(EnergySwingUp)}
+    for key in law_changes:
+        if key not in rules(type(law)):
+            raise InputError(key, law_changes[key], f"absent: the law {name} has no such term")
+    # Every law is a dataclass; the protocol that annotates them does not say so.
+    swing_up: Any = dataclasses.replace(law, **law_changes)  # type: ignore[type-var]
+    regulator = _build_regulator(changes, plant)
+    gate = _build_gate(changes, plant)
+    return Hybrid(swing_up, regulator, gate)
+
+
+def _build_regulator(changes: dict[str, Any], plant: CartPole) -> StateFeedback:
+    K = changes.pop("K", None)
+    design, gains = changes.pop("design", None), changes.pop("gains", None)
+    reference = State(changes.pop("reference_x", 0.0), 0.0, 0.0, 0.0)
+    if K is not None:
+        if design is not None or gains is not None:
+            raise InputError("gain", K, "absent where design or gains is given")
+        return StateFeedback(K, reference)
+    return StateFeedback(paper.regulator(design or "placement", gains or "printed", plant).K, reference)
+
+
+def _build_gate(changes: dict[str, Any], plant: CartPole) -> Gate:
+    name = changes.pop("gate", "angle")
+    cls = _GATES[name]
+    for key in changes:
+        if key not in rules(cls):
+            raise InputError(key, changes[key], f"absent: the gate {name} has no such term")
+    for key in ("rate", "level"):
+        if key in rules(cls) and key not in changes:
+            raise InputError(key, None, f"given: the gate {name} needs it")
+    if cls is LyapunovGate:
+        return LyapunovGate(paper.riccati_solution(plant), **changes)
+    return cls(**{"half_angle": paper.SWITCH_ANGLE, **changes})
+
+
+def build_start(given: Mapping[str, Any], seed: int) -> State:
+    """One start: drawn from the set, then the given components changed."""
+    changes = dict(given)
+    drawn = sample_starts(changes.pop("set", "rest"), 1, seed=seed)
+    return State(**{name: float(changes.get(name, getattr(drawn, name)[0])) for name in NAMES})

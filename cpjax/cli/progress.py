@@ -1,0 +1,24 @@
+"""Progress for people, on standard error: a bar on a terminal, a line per step elsewhere."""
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import TypeAlias
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+Report: TypeAlias = Callable[[int, int, str], None]
+"""Takes how much is done, of how much, and what comes next."""
+
+
+@contextlib.contextmanager
+def progress(what: str) -> Iterator[Report]:
+    """Yields the function that reports progress; `what` names the work."""
+    if not sys.stderr.isatty():
+        yield lambda done, total, text: print(f"{what}: {done}/{total} {text}", file=sys.stderr, flush=True)
+        return
+    columns = (TextColumn("{task.fields[what]}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, TextColumn("{task.description}"), console=Console(stderr=True)) as bar:
+        task = bar.add_task("", what=what)
+        yield lambda done, total, text: bar.update(task, completed=done, total=total, description=text)

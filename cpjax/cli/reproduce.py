@@ -1,0 +1,67 @@
+"""`cpjax reproduce`: the paper's controllers over a seeded set of starts, as a table, pictures and JSON."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from cpjax.cli.options import EVALUATION_OPTIONS, add_options, resolve
+from cpjax.cli.progress import progress
+from cpjax.study.reproduction import Setting, reproduce
+
+
+def add_command(commands: Any) -> None:
+    """Declares the command."""
+    text = (
+        "Every swing-up law, plant, regulator and gain of the paper over one seeded set of starts. Writes "
+        "reproduction.json, success.png and our figures in the places of the paper's Figures 3 to 6. An interrupted "
+        "run goes on where it stopped."
+    )
+    parser = commands.add_parser("reproduce", help="the paper's controllers over many starts", description=text)
+    add_options(parser, EVALUATION_OPTIONS, out="out/reproduce")
+    parser.set_defaults(run=run)
+
+
+def run(given: argparse.Namespace) -> int:
+    """Runs the command."""
+    setting = setting_of(given)
+    rows = rows_of(given, setting)
+
+    from cpjax.show.figures import save_figure, success_rates
+    from cpjax.show.reproduction import findings, pictures
+
+    save_figure(given.out / "success.png", success_rates(rows))
+    for name, figure, caption in pictures(setting):
+        save_figure(given.out / f"{name}.png", figure)
+        print(caption)
+    print_rows(rows)
+    print(*findings(rows), sep="\n")
+    print(f"wrote {given.out / 'reproduction.json'} and the pictures beside it")
+    return 0
+
+
+def setting_of(given: argparse.Namespace) -> Setting:
+    """The evaluation's setting from the options."""
+    return Setting(seed=given.seed, **resolve(given, EVALUATION_OPTIONS)["evaluation"])
+
+
+def rows_of(given: argparse.Namespace, setting: Setting) -> list[dict[str, Any]]:
+    """The reproduction, with progress shown and each row saved."""
+    with progress("reproduce") as report:
+        return reproduce(setting, progress=report, path=given.out / "reproduction.json")
+
+
+def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
+    """The table for people."""
+    from cpjax.show.reproduction import HEADER, cells
+
+    table = Table(title="Settling, travel, effort and variation over successes; peak over all runs")
+    for i, name in enumerate(HEADER):
+        table.add_column(name, justify="left" if i < 4 else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*cells(row))
+    console = Console()
+    # Where the width is not known (a file, a pipe) lines are as long as they need to be.
+    Console(width=200).print(table) if not console.is_terminal else console.print(table)

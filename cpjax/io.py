@@ -1,0 +1,247 @@
+"""Files: plants, controllers and results as JSON or TOML, written atomically.
+
+A file holds one component as a table of its fields, tagged with its `type`; the outermost table also has `schema`.
+Python floats stay numbers, float64 arrays are plain lists, other arrays are tables of `dtype` and `values`. JSON has no
+infinities, so there they are the strings "inf", "-inf" and "nan".
+"""
+
+import dataclasses
+import importlib.metadata
+import json
+import math
+import os
+import re
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import tomli_w
+
+from cpjax import paper
+from cpjax.controllers import (
+    AngleGate,
+    AngleRateGate,
+    EnergySwingUp,
+    Hybrid,
+    LyapunovGate,
+    SingleLaw,
+    StateFeedback,
+)
+from cpjax.errors import InputError
+from cpjax.plant import CartPole, Motor
+from cpjax.pytree import is_traced
+from cpjax.sim.metrics import Metrics, ProtocolMetrics
+from cpjax.sim.rollout import Trajectory
+from cpjax.state import State
+
+_NON_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
+
+SCHEMA = 1
+"""Version of the files' layout."""
+
+TYPES: dict[str, type] = {
+    cls.__name__: cls
+    for cls in (
+        State,
+        Motor,
+        CartPole,
+        StateFeedback,
+        EnergySwingUp,
+        paper.PrintedSwingUp,
+        paper.CorrectedSwingUpAsVoltage,
+        AngleGate,
+        AngleRateGate,
+        LyapunovGate,
+        Hybrid,
+        SingleLaw,
+        ProtocolMetrics,
+        Metrics,
+        Trajectory,
+    )
+}
+"""What can be saved, by the tag in the file."""
+
+
+def save(path: str | Path, thing: Any) -> None:
+    """Writes a plant, controller, state or result; JSON or TOML by the path's extension.
+
+    Raises:
+      InputError: another extension, a component that is not in `TYPES`, or values that JAX is tracing.
+    """
+    path = Path(path)
+    suffix = _suffix(path)
+    table = {"schema": SCHEMA, **encode(thing)}
+    write_text(path, tomli_w.dumps(table) if suffix == ".toml" else dump_json(table))
+
+
+def load(path: str | Path) -> Any:
+    """What `save` wrote, or a file written by hand in the same layout. Fields with a default may be left out.
+
+    Raises:
+      InputError: no such file, not JSON or TOML, another schema, an unknown type or key, a missing key, or a value
+        outside its range.
+    """
+    path = Path(path)
+    table = read_table(path)
+    schema = table.pop("schema", SCHEMA)
+    if schema != SCHEMA:
+        raise InputError(f"{path}: schema", schema, f"{SCHEMA}, the layout that this version of cpjax reads")
+    return _decode(table, str(path))
+
+
+def encode(thing: Any) -> dict[str, Any]:
+    """A component as a table of plain values."""
+    name = type(thing).__name__
+    if TYPES.get(name) is not type(thing):
+        raise InputError("thing", thing, "one of " + ", ".join(TYPES))
+    fields = {f.name: getattr(thing, f.name) for f in dataclasses.fields(TYPES[name])}
+    return {"type": name, **{key: _encode_value(f"{name}.{key}", value) for key, value in fields.items()}}
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """The outermost table of a JSON or TOML file.
+
+    Raises:
+      InputError: no such file, or not a table in the format of its extension.
+    """
+    suffix = _suffix(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as problem:
+        raise InputError("path", str(path), f"a readable text file ({problem})") from problem
+    try:
+        table = tomllib.loads(text) if suffix == ".toml" else _numbers(json.loads(text))
+    except ValueError as problem:
+        raise InputError("path", str(path), f"a valid {suffix[1:].upper()} file ({problem})") from problem
+    if not isinstance(table, dict):
+        raise InputError("path", str(path), "a file that holds one table")
+    return table
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Writes plain values (dicts, lists, numbers, NumPy and JAX arrays) as JSON, atomically."""
+    write_text(path, dump_json(data))
+
+
+def dump_json(data: Any) -> str:
+    """Strict JSON; non-finite numbers as strings."""
+    text = json.dumps(_plain(data), indent=1, allow_nan=False)
+    # A list of numbers on one line. Strings hold no raw line breaks, so none of them is touched.
+    return re.sub(r"\[[^][{}]*\]", lambda match: re.sub(r"\n\s*", " ", match[0]), text) + "\n"
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a UTF-8 file atomically."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Writes a file atomically: it has its old content or all of the new, whatever happens in between.
+
+    Raises:
+      InputError: the folder cannot be made or written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as problem:
+        raise InputError("path", str(path), f"a place that can be written ({problem})") from problem
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)  # mkstemp's files are private; this one is an ordinary file
+        os.replace(temporary, path)
+    except BaseException as problem:
+        Path(temporary).unlink(missing_ok=True)
+        if isinstance(problem, OSError):
+            raise InputError("path", str(path), f"a place that can be written ({problem})") from problem
+        raise
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    return {name: importlib.metadata.version(name) for name in ("cpjax", "jax", "jaxlib", "numpy", "scipy")}
+
+
+def _suffix(path: Path) -> str:
+    if path.suffix.lower() not in (".json", ".toml"):
+        raise InputError("path", str(path), "a file name that ends in .json or .toml")
+    return path.suffix.lower()
+
+
+def _encode_value(name: str, value: Any) -> Any:
+    if is_traced(value):
+        raise InputError(name, value, "a value outside jit, vmap and grad")
+    if dataclasses.is_dataclass(value):
+        return encode(value)
+    if isinstance(value, (bool, int, float, str)):
+        return value
+    array = np.asarray(value)
+    if array.dtype == np.float64:
+        return array.tolist()
+    return {"dtype": str(array.dtype), "values": array.tolist()}
+
+
+def _decode(table: dict[str, Any], path: str) -> Any:
+    table = dict(table)
+    tag = table.pop("type", None)
+    if tag not in TYPES:
+        raise InputError(f"{path}: type", tag, "one of " + ", ".join(TYPES))
+    cls = TYPES[tag]
+    fields = {f.name: f for f in dataclasses.fields(cls)}
+    for key in table:
+        if key not in fields:
+            raise InputError(f"{path}: key", key, f"one of {tag}'s fields: " + ", ".join(fields))
+    optional = (dataclasses.MISSING, dataclasses.MISSING)
+    for name, field in fields.items():
+        if name not in table and (field.default, field.default_factory) == optional:
+            raise InputError(f"{path}: key", name, f"present: {tag} has no default for it")
+    values = {key: _decode_value(value, f"{path}: {key}") for key, value in table.items()}
+    try:
+        return cls(**values)
+    except InputError as problem:
+        raise InputError(f"{path}: {problem.field}", problem.value, problem.allowed) from problem
+
+
+def _decode_value(value: Any, path: str) -> Any:
+    if isinstance(value, dict):
+        if set(value) != {"dtype", "values"}:
+            return _decode(value, path)
+        try:
+            return np.asarray(value["values"], dtype=value["dtype"])
+        except (TypeError, ValueError) as problem:
+            raise InputError(path, value, "a table of dtype and values that fit each other") from problem
+    if isinstance(value, list):
+        try:
+            return np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError) as problem:
+            raise InputError(path, value, "a list of numbers, nested evenly") from problem
+    return value
+
+
+def _numbers(data: Any) -> Any:
+    """Undoes what `_plain` did to non-finite numbers."""
+    if isinstance(data, dict):
+        return {key: _numbers(value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [_numbers(value) for value in data]
+    return _NON_FINITE.get(data, data) if isinstance(data, str) else data
+
+
+def _plain(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {str(key): _plain(value) for key, value in data.items()}
+    if isinstance(data, (list, tuple)):
+        return [_plain(value) for value in data]
+    if isinstance(data, (np.ndarray, np.generic, jax.Array)):
+        return _plain(np.asarray(data).tolist())
+    if isinstance(data, float) and not math.isfinite(data):
+        return str(data)
+    return data

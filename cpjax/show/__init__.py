@@ -1,0 +1,1 @@
+"""Figures and the report page. The only room that imports matplotlib."""

@@ -1,0 +1,85 @@
+"""A report as one self-contained HTML page: no script, no request, pictures inside."""
+
+import base64
+import html
+from collections.abc import Sequence
+from pathlib import Path
+
+from cpjax import io
+
+_STYLE = """
+:root { color-scheme: light dark; --ink: #1b1f24; --paper: #ffffff; --soft: #5b6570; --line: #d8dee4; --band: #f4f6f8; }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e6e9ec; --paper: #14171a; --soft: #9aa4ae; --line: #333a41; --band: #1d2226; }
+}
+* { box-sizing: border-box; }
+body { margin: 0 auto; max-width: 68rem; padding: 1.5rem 1rem 4rem; background: var(--paper); color: var(--ink);
+  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+h1 { line-height: 1.2; font-size: 1.9rem; margin: 0.5rem 0; } h2 { margin-top: 2.6rem; font-size: 1.35rem; }
+p.lead { font-size: 1.1rem; color: var(--soft); } figure { margin: 1.5rem 0; }
+figure img { display: block; width: 100%; height: auto; background: #fff; border: 1px solid var(--line);
+  border-radius: 6px; }
+figcaption, .note { color: var(--soft); font-size: 0.93rem; margin-top: 0.4rem; }
+.scroll { overflow-x: auto; border: 1px solid var(--line); border-radius: 6px; }
+table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
+th, td { padding: 0.35rem 0.6rem; text-align: right; white-space: nowrap; }
+th { background: var(--band); font-weight: 600; vertical-align: bottom; }
+th.text, td.text { text-align: left; } tbody tr + tr td { border-top: 1px solid var(--line); }
+code { font-size: 0.92em; background: var(--band); padding: 0.05em 0.3em; border-radius: 4px; }
+@media print { body { max-width: none; } figure, tr { break-inside: avoid; } .scroll { overflow: visible; border: 0; }
+  table { font-size: 0.7rem; } }
+"""
+
+
+class Page:
+    """Collects sections in order and writes them as one file."""
+
+    def __init__(self, title: str, lead: str) -> None:
+        self._title = title
+        self._body = [f"<h1>{html.escape(title)}</h1>", f'<p class="lead">{html.escape(lead)}</p>']
+
+    def section(self, title: str) -> None:
+        """Begins a section."""
+        self._body.append(f"<h2>{html.escape(title)}</h2>")
+
+    def text(self, text: str) -> None:
+        """A paragraph; `code` in backticks."""
+        self._body.append(f"<p>{_inline(text)}</p>")
+
+    def note(self, text: str) -> None:
+        """A paragraph in small print."""
+        self._body.append(f'<p class="note">{_inline(text)}</p>')
+
+    def table(self, header: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int) -> None:
+        """A table whose first `text_columns` columns are words and whose others are numbers."""
+
+        def row(tag: str, cells: Sequence[str]) -> str:
+            kinds = [' class="text"' if i < text_columns else "" for i in range(len(cells))]
+            return "".join(f"<{tag}{k}>{html.escape(c)}</{tag}>" for k, c in zip(kinds, cells, strict=True))
+
+        body = "\n".join(f"<tr>{row('td', cells)}</tr>" for cells in rows)
+        head = f"<thead><tr>{row('th', header)}</tr></thead>"
+        self._body.append(f'<div class="scroll"><table>{head}<tbody>\n{body}\n</tbody></table></div>')
+
+    def picture(self, png: bytes, caption: str) -> None:
+        """A figure with one sentence that says what to see."""
+        data = base64.b64encode(png).decode("ascii")
+        alt = html.escape(caption, quote=True)
+        image = f'<img alt="{alt}" src="data:image/png;base64,{data}">'
+        self._body.append(f"<figure>{image}<figcaption>{_inline(caption)}</figcaption></figure>")
+
+    def write(self, path: Path) -> None:
+        """Writes the page atomically."""
+        body = "\n".join(self._body)
+        io.write_text(
+            path,
+            f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+            f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+            f"<title>{html.escape(self._title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n",
+        )
+
+
+def _inline(text: str) -> str:
+    """Escaped text, with what stands between backticks as code."""
+    pieces = html.escape(text).split("`")
+    return "".join(f"<code>{piece}</code>" if i % 2 else piece for i, piece in enumerate(pieces))

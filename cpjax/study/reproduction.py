@@ -1,0 +1,133 @@
+"""The paper's controllers, run fairly: every law on every plant with every gain, over one seeded set of starts."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from cpjax import io, paper
+from cpjax.errors import InputError
+from cpjax.sim.metrics import Metrics
+from cpjax.sim.rollout import Trajectory, rollout
+from cpjax.sim.sweep import sweep
+from cpjax.starts import sample_starts
+from cpjax.state import HANGING, State
+from cpjax.study.summary import summarise
+
+DESIGNS: tuple[paper.Design, ...] = ("placement", "lqr")
+GAINS: tuple[paper.Gains, ...] = ("printed", "computed")
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One controller on one plant."""
+
+    law: str
+    plant: str
+    design: paper.Design
+    gains: paper.Gains
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """How the protocol's evaluation runs are made: RK4, the sampled clock with one control instant a step."""
+
+    starts: str = "hanging"
+    count: int = 4096
+    seed: int = 1
+    duration: float = 20.0
+    dt: float = 0.002
+
+
+def variants() -> list[Variant]:
+    """All of them, in the order of the tables."""
+    return [Variant(*choice) for choice in itertools.product(paper.LAWS, paper.PLANTS, DESIGNS, GAINS)]
+
+
+def evaluate(variant: Variant, setting: Setting, starts: State | None = None) -> Metrics:
+    """Metrics of one variant over the setting's starts."""
+    plant = paper.PLANTS[variant.plant]()
+    controller = paper.controller(variant.law, variant.design, plant, variant.gains)
+    if starts is None:
+        starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
+    metrics: Metrics = sweep(plant, controller, starts, duration=setting.duration, dt=setting.dt, clock="sampled")
+    return metrics
+
+
+def reproduce(
+    setting: Setting, *, progress: Callable[[int, int, str], None] | None = None, path: Path | None = None
+) -> list[dict[str, Any]]:
+    """One row per variant: the variant's names beside what `summarise` says of its metrics.
+
+    Args:
+      progress: called with the rows done, their number, and the next row in words.
+      path: where to save the rows after each of them (JSON). Rows of an interrupted run with the same setting and
+        version, found there, are not computed again.
+
+    Raises:
+      InputError: a setting outside its range, or a `path` that cannot be written.
+    """
+    todo = variants()
+    rows = _resume(path, setting) if path is not None else []
+    starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
+    for variant in todo[len(rows) :]:
+        if progress is not None:
+            progress(len(rows), len(todo), f"{variant.law}, {variant.plant}, {variant.design}, {variant.gains}")
+        rows.append({**dataclasses.asdict(variant), **summarise(evaluate(variant, setting, starts))})
+        if path is not None:
+            io.write_json(path, _document(setting, rows))
+    if progress is not None:
+        progress(len(todo), len(todo), "done")
+    return rows
+
+
+def representative(law: str, design: paper.Design, plant: str, setting: Setting) -> tuple[str, State]:
+    """A start to show one variant by, with what it is in words.
+
+    Exactly hanging at rest, for a law that starts from there; for one that does not, the start of the set whose
+    settling time is the median of the successful ones, or the set's first start if none is.
+    """
+    if law.startswith("corrected") and law != "corrected-as-voltage":
+        return "exactly hanging at rest", HANGING
+    starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
+    metrics = evaluate(Variant(law, plant, design, "printed"), setting, starts)
+    times = np.where(np.asarray(metrics.success), np.asarray(metrics.settling_time), np.inf)
+    successes = int(np.isfinite(times).sum())
+    index = int(np.argsort(times)[(successes - 1) // 2]) if successes else 0
+    words = "the median success" if successes else "the first start"
+    start: State = jax.tree.map(lambda column: float(column[index]), starts)
+    return f"{words} of {setting.count} {setting.starts} starts (number {index})", start
+
+
+def trajectory(law: str, design: paper.Design, plant: str, start: State, setting: Setting) -> Trajectory:
+    """One rollout with the printed gains, under the protocol."""
+    model = paper.PLANTS[plant]()
+    controller = paper.controller(law, design, model)
+    return rollout(model, controller, start, duration=setting.duration, dt=setting.dt, clock="sampled")
+
+
+def _document(setting: Setting, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "what": "the paper's controllers over a seeded set of starts",
+        "versions": io.versions(),
+        "setting": dataclasses.asdict(setting),
+        "complete": len(rows) == len(variants()),
+        "rows": rows,
+    }
+
+
+def _resume(path: Path, setting: Setting) -> list[dict[str, Any]]:
+    """Rows of an interrupted run that this one would compute again to the letter."""
+    if not path.exists():
+        return []
+    try:
+        document = io.read_table(path)
+    except InputError:
+        return []  # something else, or broken: it is overwritten by the first row
+    expected = _document(setting, [])
+    same = all(document.get(key) == expected[key] for key in ("what", "versions", "setting"))
+    return list(document["rows"]) if same and not document.get("complete", True) else []
