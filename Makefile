@@ -1,0 +1,44 @@
+# `make report` and `make test` set up what they need: a virtual environment in .venv with the versions of
+# constraints.txt, which are the ones that are tested. Remake it with `make clean`.
+
+PYTHON ?= python3
+OUT ?= out
+BIN := .venv/bin
+
+.PHONY: report test test-slow check format build clean
+
+report: .venv/ready  ## the main job: the paper's controllers, reproduced, as one HTML page
+	$(BIN)/cpjax report --out $(OUT)/report
+
+test: check  ## linter, type checker, tests with warnings as errors
+	$(BIN)/python -m pytest -n 2
+
+test-slow: .venv/ready-test  ## the tests that take minutes
+	$(BIN)/python -m pytest -n 2 -m slow
+
+check: .venv/ready-test
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+format: .venv/ready-test  ## puts the code into the form that `make check` wants
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+build: .venv/ready-test  ## sdist and wheel in dist/
+	$(BIN)/python -m build --outdir dist
+
+clean:
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache
+
+.venv/bin/python:
+	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "cpjax needs Python 3.11 or newer; this is " + sys.version.split()[0] + ". Use: make PYTHON=python3.11")'
+	$(PYTHON) -m venv .venv
+
+.venv/ready: .venv/bin/python pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable .
+	touch $@
+
+.venv/ready-test: .venv/ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[test,peers]'
+	touch $@
