@@ -18,6 +18,7 @@ from cpjax.controllers import (
     StateFeedback,
 )
 from cpjax.errors import InputError
+from cpjax.io import load, save
 from cpjax.plant import CartPole, LinearModel, Motor, linearize
 from cpjax.sim.flags import Flag
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
@@ -53,9 +54,11 @@ __all__ = [
     "Trajectory",
     "__version__",
     "linearize",
+    "load",
     "measure",
     "paper",
     "rollout",
     "sample_starts",
+    "save",
     "sweep",
 ]

@@ -86,16 +86,16 @@ def findings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         if two_proportion_p_value(a["successes"], a["count"], b["successes"], b["count"]) < 1e-3:
             ahead["placement" if a["successes"] > b["successes"] else "lqr"] += 1
     as_voltage = max(r["success_rate"] for r in rows if r["law"] == "corrected-as-voltage")
-    printed, corrected, centred = (
-        f"{rate(law, 'placement')} of the starts with pole placement and {rate(law, 'lqr')} with LQR"
-        for law in ("as-printed", "corrected", "corrected-centred")
-    )
+
+    def caught(law: str) -> str:
+        return f"{rate(law, 'placement')} of the starts with pole placement and {rate(law, 'lqr')} with LQR"
+
     return [
-        f"On the appendix's plant, the law and the gains as printed catch {printed}.",
-        f"The energy law corrected, with the paper's k = 0.2, catches {corrected}; the same law read as a voltage, "
+        f"On the appendix's plant, the law and the gains as printed catch {caught('as-printed')}.",
+        f"The energy law corrected, with the paper's k = 0.2, catches {caught('corrected')}; the same law read as a voltage, "
         f"{100 * as_voltage:.1f} % at most.",
         f"With a larger energy gain and the cart held near the middle (no longer the paper's law), the printed gains "
-        f"catch {centred}.",
+        f"catch {caught('corrected-centred')}.",
         f"The paper sees slightly better performance with LQR. In these {len(pairs)} comparisons on both plants, with "
         f"the gains as printed and the clip at 12 V, pole placement catches more starts in {ahead['placement']}, LQR in "
         f"{ahead['lqr']} (differences beyond a two-proportion test at 99.9 %).",

@@ -1,0 +1,84 @@
+"""What it costs to begin: import times, the first swing-up on the command line, memory of a large sweep.
+
+    python experiments/start_up.py
+
+Each figure is of fresh processes, several times, with the median quoted; the imports of jax and of
+cpjax are timed in turn.
+"""
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from _common import run
+
+from cpjax import io
+
+IMPORT = "import time; t = time.perf_counter(); import {}; print(time.perf_counter() - t)"
+SWEEP = """
+import json, resource, time, jax
+jax.config.update("jax_enable_x64", True)
+import cpjax
+from cpjax import paper
+
+plant = paper.appendix_plant()
+controller = paper.controller("corrected-centred", "placement", plant)
+starts = cpjax.sample_starts("hanging", {count}, seed={seed})
+settings = dict(duration={duration}, dt=0.002, clock="sampled")
+run = jax.jit(jax.vmap(lambda start: cpjax.measure(plant, controller, start, **settings)))
+seconds = []
+for _ in range(2):
+    begin = time.perf_counter()
+    metrics = jax.block_until_ready(run(starts))
+    seconds.append(time.perf_counter() - begin)
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+print(json.dumps(dict(first_s=seconds[0], second_s=seconds[1], peak_MiB=peak, success=float(metrics.success.mean()))))
+"""
+
+
+def python(code: str) -> str:
+    """What a fresh interpreter prints."""
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+
+
+def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
+    """Prints the figures and writes start_up.json."""
+    repeats = 1 if quick else 5
+    imports: dict[str, list[float]] = {"jax, jax.numpy": [], "cpjax": []}
+    first: list[float] = []
+    for _ in range(repeats):
+        for name, times in imports.items():
+            times.append(float(python(IMPORT.format(name))))
+        with tempfile.TemporaryDirectory() as folder:
+            begin = time.perf_counter()
+            command = [sys.executable, "-m", "cpjax", "swingup", "--out", folder]
+            subprocess.run(command, capture_output=True, check=True)
+            first.append(time.perf_counter() - begin)
+    count, duration = (64, 1.0) if quick else (4096, 10.0)
+    measured = json.loads(python(SWEEP.format(count=count, seed=seed, duration=duration)))
+    sweep = {"starts": count, "duration_s": duration, **measured}
+    result: dict[str, Any] = {
+        "versions": io.versions(),
+        "import_jax_s": statistics.median(imports["jax, jax.numpy"]),
+        "import_cpjax_s": statistics.median(imports["cpjax"]),
+        "first_swingup_s": statistics.median(first),
+        "sweep": sweep,
+    }
+    io.write_json(out / "start_up.json", result)
+    print(f"import jax     {result['import_jax_s']:.2f} s")
+    print(f"import cpjax   {result['import_cpjax_s']:.2f} s, jax included")
+    print(f"cpjax swingup  {result['first_swingup_s']:.2f} s, from the shell's prompt to the files")
+    print(
+        f"{count} starts x {duration:g} s at 2 ms: {sweep['first_s']:.2f} s with compilation, "
+        f"{sweep['second_s']:.2f} s without, peak memory of the process {sweep['peak_MiB']:.0f} MiB"
+    )
+    return result
+
+
+if __name__ == "__main__":
+    run(main, __doc__ or "")
