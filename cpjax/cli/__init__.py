@@ -23,8 +23,8 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {message}\n")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command and returns its exit code; see `EXIT_CODES`."""
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
     from cpjax.cli import report, reproduce, swingup
 
     parser = _Parser(
@@ -37,6 +37,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
     for module in (swingup, reproduce, report):
         module.add_command(commands)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command and returns its exit code; see `EXIT_CODES`."""
+    parser = make_parser()
     try:
         options = parser.parse_args(arguments)
     except SystemExit as stop:  # argparse ends the process itself; as a function, main returns

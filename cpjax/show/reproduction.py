@@ -92,13 +92,13 @@ def findings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
     return [
         f"On the appendix's plant, the law and the gains as printed catch {caught('as-printed')}.",
-        f"The energy law corrected, with the paper's k = 0.2, catches {caught('corrected')}; the same law read as a voltage, "
-        f"{100 * as_voltage:.1f} % at most.",
+        f"The energy law corrected, with the paper's k = 0.2, catches {caught('corrected')}; the same law read "
+        f"as a voltage, {100 * as_voltage:.1f} % at most.",
         f"With a larger energy gain and the cart held near the middle (no longer the paper's law), the printed gains "
         f"catch {caught('corrected-centred')}.",
         f"The paper sees slightly better performance with LQR. In these {len(pairs)} comparisons on both plants, with "
-        f"the gains as printed and the clip at 12 V, pole placement catches more starts in {ahead['placement']}, LQR in "
-        f"{ahead['lqr']} (differences beyond a two-proportion test at 99.9 %).",
+        f"the gains as printed and the clip at 12 V, pole placement catches more starts in {ahead['placement']}, LQR "
+        f"in {ahead['lqr']} (differences beyond a two-proportion test at 99.9 %).",
     ]
 
 
