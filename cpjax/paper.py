@@ -64,10 +64,11 @@ def appendix_plant() -> CartPole:
 
 
 def identified_plant() -> CartPole:
-    """The plant from which all eight printed gains do follow, to within a unit of their last printed digit.
+    """The plant from which all eight printed gains do follow, to within half a unit of their last printed digit.
 
     It differs from the appendix in two numbers, the force per volt k_T / (R r) = 1.03846 N/V and the total damping
-    d = 1.93007 N s/m. R is kept, so k_T follows from the first and k_V from the second; the gains say nothing about R.
+    d = 1.93007 N s/m; the print fixes them to about 1e-4 N/V and 5e-3 N s/m, the further digits are a choice. R is
+    kept, so k_T follows from the first and k_V from the second; the gains say nothing about R.
     """
     force_per_voltage, damping = 1.03846, 1.93007
     resistance, viscous_friction = 1.25, 1e-5

@@ -213,6 +213,24 @@ def is_traced(value: Any) -> bool:
     return isinstance(value, jax.core.Tracer)
 
 
+def check_unbatched(name: str, tree: Any) -> None:
+    """Refuses a component with a batch axis, which only `vmap` may take away.
+
+    Raises:
+      InputError: a number that is an array, or a matrix with more axes than declared.
+    """
+    if not dataclasses.is_dataclass(tree):
+        return
+    declared = rules(type(tree))
+    for field in dataclasses.fields(tree):
+        value, rule = getattr(tree, field.name), declared.get(field.name)
+        expected = rule.shape if isinstance(rule, Matrix) else () if isinstance(rule, Number) else None
+        if expected is not None and np.shape(value) != expected:
+            allowed = f"of shape {expected}; batches go through jax.vmap"
+            raise InputError(f"{name}.{field.name}", f"array of shape {np.shape(value)}", allowed)
+        check_unbatched(f"{name}.{field.name}", value)
+
+
 def cast(tree: T, dtype: Any) -> T:
     """`tree` with every leaf as a JAX array of `dtype`. Traced leaves are converted too, with their derivatives."""
     import jax.numpy as jnp

@@ -8,6 +8,8 @@ so a = -k E theta' cos(theta) drives E to zero from either side. The law asks fo
 yields it follows from its own model of the plant, which need not be the true one.
 """
 
+import math
+
 import jax.numpy as jnp
 
 from cpjax.numeric.trigonometry import sin_cos
@@ -26,7 +28,8 @@ class EnergySwingUp:
     `kick` [m/s^2] towards positive x, weighted by s = (1 - w)^3 for w < 1 and 0 beyond, where w is the pendulum's
     energy above hanging, in units of the energy of a swing of amplitude `kick_radius`. So s is 1 hanging at rest, falls
     to 0 (with two continuous derivatives) within a swing of `kick_radius`, and elsewhere the law is exactly the energy
-    law. Inside, the kick takes the place of the centring, which could otherwise balance it and hold the cart.
+    law. Inside, the kick takes the place of the centring, which could otherwise balance it and hold the cart. With
+    `kick = 0` there is no kick and s is 0 everywhere.
     """
 
     model: CartPole = part("the law's own idea of the plant, a CartPole", "force_for_acceleration", "motor")
@@ -34,7 +37,9 @@ class EnergySwingUp:
     cart_stiffness: Scalar = number("1/s^2", "pull of the cart to x = 0", default=0.0, at_least=0.0)
     cart_damping: Scalar = number("1/s", "damping of the cart", default=0.0, at_least=0.0)
     kick: Scalar = number("m/s^2", "acceleration hanging at rest; 0 for none", default=0.5)
-    kick_radius: Scalar = number("rad", "swing amplitude beyond which the kick is gone", default=0.02, above=0.0)
+    kick_radius: Scalar = number(
+        "rad", "swing amplitude beyond which the kick is gone", default=0.02, above=0.0, at_most=math.pi / 2
+    )
 
     def acceleration(self, state: State) -> Scalar:
         """The pivot acceleration that the law asks for [m/s^2]."""
@@ -54,6 +59,7 @@ class EnergySwingUp:
         _, cos = sin_cos(state.theta)
         weight = self.model.pole_mass * self.model.gravity * self.model.pole_length
         above_rest = 0.5 * self.model.pivot_inertia * state.theta_dot * state.theta_dot / weight + (1.0 + cos)
-        room = 1.0 - above_rest / (0.5 * self.kick_radius * self.kick_radius)
+        _, edge = sin_cos(self.kick_radius)
+        room = 1.0 - above_rest / (1.0 - edge)
         inside = jnp.maximum(room, 0.0)  # its kink vanishes in the cube
-        return inside * inside * inside
+        return jnp.where(self.kick == 0.0, 0.0, inside * inside * inside)

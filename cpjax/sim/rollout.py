@@ -16,7 +16,7 @@ from cpjax.controllers.protocol import Controller, Law, as_controller
 from cpjax.errors import InputError
 from cpjax.numeric.trigonometry import sin_cos
 from cpjax.plant import CartPole
-from cpjax.pytree import cast, is_traced, pytree
+from cpjax.pytree import cast, check_unbatched, is_traced, pytree
 from cpjax.sim.flags import CHATTER_LENGTH, RUNAWAY_LIMIT, STOPPED, Flag
 from cpjax.sim.integrators import INTEGRATORS
 from cpjax.sim.metrics import Fold, ProtocolMetrics, Sample
@@ -233,9 +233,12 @@ def _cast_arguments(
     if not isinstance(plant, CartPole):
         raise InputError("plant", plant, "a cpjax.CartPole")
     fold = ProtocolMetrics() if fold is None else fold
+    controller = as_controller(controller)
+    for name, part in (("plant", plant), ("controller", controller), ("metrics", fold)):
+        check_unbatched(name, part)
     return (
         cast(plant, dtype),
-        cast(as_controller(controller), dtype),
+        cast(controller, dtype),
         cast(fold, dtype),
         jnp.asarray(dt, dtype=dtype),
     )
