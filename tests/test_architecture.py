@@ -10,7 +10,21 @@ import pytest
 import cpjax
 
 ROOT = Path(cpjax.__file__).parent
-ROOMS = "errors pytree numeric state starts plant controllers paper sim io study show cli".split()
+ROOMS = [
+    "errors",
+    "pytree",
+    "numeric",
+    "state",
+    "starts",
+    "plant",
+    "controllers",
+    "paper",
+    "sim",
+    "io",
+    "study",
+    "show",
+    "cli",
+]
 HEAVY = ("matplotlib", "scipy", "control", "optax", "rich")
 
 
