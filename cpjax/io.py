@@ -87,7 +87,7 @@ def load(path: str | Path) -> Any:
     path = Path(path)
     table = read_table(path)
     schema = table.pop("schema", SCHEMA)
-    if schema != SCHEMA:
+    if isinstance(schema, bool) or schema != SCHEMA:
         raise InputError(f"{path}: schema", schema, f"{SCHEMA}, the layout that this version of cpjax reads")
     return _decode(table, str(path))
 
@@ -110,11 +110,11 @@ def read_table(path: Path) -> dict[str, Any]:
     suffix = _suffix(path)
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as problem:
+    except (OSError, ValueError) as problem:  # ValueError: not UTF-8, or a null byte in the path
         raise InputError("path", str(path), f"a readable text file ({problem})") from problem
     try:
-        table = tomllib.loads(text) if suffix == ".toml" else _numbers(json.loads(text))
-    except ValueError as problem:
+        table = tomllib.loads(text) if suffix == ".toml" else _numbers(json.loads(text, object_pairs_hook=_once))
+    except (ValueError, RecursionError) as problem:
         raise InputError("path", str(path), f"a valid {suffix[1:].upper()} file ({problem})") from problem
     if not isinstance(table, dict):
         raise InputError("path", str(path), "a file that holds one table")
@@ -147,7 +147,7 @@ def write_bytes(path: Path, content: bytes) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as problem:
+    except (OSError, ValueError) as problem:  # ValueError: a null byte in the path
         raise InputError("path", str(path), f"a place that can be written ({problem})") from problem
     try:
         with os.fdopen(handle, "wb") as file:
@@ -184,6 +184,8 @@ def _encode_value(name: str, value: Any) -> Any:
     if isinstance(value, (bool, int, float, str)):
         return value
     array = np.asarray(value)
+    if array.dtype.kind not in "biuf":
+        raise InputError(name, value, "a number, an array of numbers, or one of " + ", ".join(TYPES))
     if array.dtype == np.float64:
         return array.tolist()
     return {"dtype": str(array.dtype), "values": array.tolist()}
@@ -192,7 +194,7 @@ def _encode_value(name: str, value: Any) -> Any:
 def _decode(table: dict[str, Any], path: str) -> Any:
     table = dict(table)
     tag = table.pop("type", None)
-    if tag not in TYPES:
+    if not isinstance(tag, str) or tag not in TYPES:
         raise InputError(f"{path}: type", tag, "one of " + ", ".join(TYPES))
     cls = TYPES[tag]
     fields = {f.name: f for f in dataclasses.fields(cls)}
@@ -215,15 +217,29 @@ def _decode_value(value: Any, path: str) -> Any:
         if set(value) != {"dtype", "values"}:
             return _decode(value, path)
         try:
-            return np.asarray(value["values"], dtype=value["dtype"])
-        except (TypeError, ValueError) as problem:
+            array = np.asarray(value["values"], dtype=value["dtype"])
+            if array.dtype.kind not in "biuf":
+                raise ValueError(f"dtype {array.dtype}")
+            return array
+        except (TypeError, ValueError, OverflowError) as problem:
             raise InputError(path, value, "a table of dtype and values that fit each other") from problem
     if isinstance(value, list):
         try:
-            return np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError) as problem:
-            raise InputError(path, value, "a list of numbers, nested evenly") from problem
+            array = np.asarray(value)
+            if array.dtype.kind not in "fiu" and array.size:
+                raise ValueError("text, booleans or an uneven nesting")
+            return array.astype(np.float64)
+        except (TypeError, ValueError, OverflowError) as problem:
+            raise InputError(path, value, f"a list of numbers, nested evenly ({problem})") from problem
     return value
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object's table, in which a key may stand once, as in TOML."""
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        raise ValueError("a key is given twice in one table: " + ", ".join(key for key, _ in pairs))
+    return table
 
 
 def _numbers(data: Any) -> Any:

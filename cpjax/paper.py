@@ -6,7 +6,7 @@ Its sections are cited below; docs/paper.md lists its errors in print with the t
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -140,24 +140,38 @@ def computed_gain(design: Design, plant: CartPole) -> np.ndarray:
     """The gain (1, 4) that the paper's poles or weights really give on `plant`.
 
     Raises:
-      InputError: `design` is not one of the two.
+      InputError: `design` is not one of the two, or the plant has no such gain.
     """
     _check_choice("design", design, get_args(Design))
-    A, B = (np.asarray(part_, dtype=float) for part_ in linearize(plant))
-    if design == "placement":
-        from scipy.signal import place_poles
+    A, B = _linear_model(plant)
+    if design == "lqr":
+        return B.T @ riccati_solution(plant) / R
+    from scipy.signal import place_poles
 
+    try:
         return np.asarray(place_poles(A, B, POLES).gain_matrix)
-    return B.T @ riccati_solution(plant) / R
+    except (ValueError, np.linalg.LinAlgError) as problem:
+        raise InputError("plant", plant, f"one for which a placement gain can be computed ({problem})") from problem
 
 
 def riccati_solution(plant: CartPole) -> np.ndarray:
     """P (4, 4) of the paper's linear quadratic regulator on `plant` (section IV-B, "State Dependent" there)."""
     from scipy.linalg import solve_continuous_are
 
-    A, B = (np.asarray(part_, dtype=float) for part_ in linearize(plant))
-    P = solve_continuous_are(A, B, np.diag(Q), np.array([[R]]))
+    A, B = _linear_model(plant)
+    try:
+        P = solve_continuous_are(A, B, np.diag(Q), np.array([[R]]))
+    except (ValueError, np.linalg.LinAlgError) as problem:
+        raise InputError(
+            "plant", plant, f"one for which an LQR gain, or P of a lyapunov gate, can be computed ({problem})"
+        ) from problem
     return np.asarray(P + P.T) / 2
+
+
+def _linear_model(plant: CartPole) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """A and B as NumPy arrays, which SciPy takes."""
+    A, B = linearize(plant)
+    return np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
 
 
 def regulator(design: Design, gains: Gains, plant: CartPole) -> StateFeedback:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from cpjax.errors import InputError
 from cpjax.numeric.trigonometry import sin_cos
-from cpjax.pytree import Scalar, is_traced, number, part, pytree
+from cpjax.pytree import Number, Scalar, is_traced, number, part, pytree
 from cpjax.state import HANGING, UPRIGHT, State
 
 
@@ -111,6 +111,8 @@ class CartPole:
         Args:
           others: the remaining fields of `CartPole`.
         """
+        mass = Number("kg", "mass of the rod", above=0.0).normalise("CartPole.rod: mass", mass)
+        length = Number("m", "length of the rod", above=0.0).normalise("CartPole.rod: length", length)
         return cls(pole_mass=mass, pole_length=length / 2, pole_inertia=mass * length * length / 12, **others)
 
     @property
@@ -207,11 +209,15 @@ def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | Stat
     Raises:
       InputError: `equilibrium` is another word, or a concrete State that is none.
     """
+    if not isinstance(plant, CartPole):
+        raise InputError("plant", plant, "a cpjax.CartPole")
     named = {"upright": UPRIGHT, "hanging": HANGING}
     if isinstance(equilibrium, str):
         if equilibrium not in named:
             raise InputError("equilibrium", equilibrium, "upright, hanging or a State")
         equilibrium = named[equilibrium]
+    if not isinstance(equilibrium, State):
+        raise InputError("equilibrium", equilibrium, "upright, hanging or a State")
 
     def field(vector: jax.Array, voltage: jax.Array) -> jax.Array:
         return plant.vector_field(State.from_vector(vector), voltage).vector()
@@ -221,7 +227,9 @@ def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | Stat
     voltage = jnp.zeros((), dtype=dtype)
     A, B = jax.jacfwd(field, argnums=(0, 1))(vector, voltage)
     drift = field(vector, voltage)
+    if not is_traced(A) and not bool(jnp.all(jnp.isfinite(A)) & jnp.all(jnp.isfinite(B))):
+        raise InputError("plant", plant, "one with a finite linear model; no gain can be computed for this one")
     # What A makes of a displacement by 1e-6: more than float32 misses pi by, less than a linear model would notice.
-    if not is_traced(drift) and float(jnp.max(jnp.abs(drift))) > 1e-6 * float(jnp.max(jnp.abs(A))):
+    if not is_traced(drift) and not bool(jnp.max(jnp.abs(drift)) <= 1e-6 * jnp.max(jnp.abs(A))):  # NaN is refused
         raise InputError("equilibrium", equilibrium, "a state at rest in which nothing accelerates")
     return LinearModel(A, B[:, None])

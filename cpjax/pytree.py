@@ -53,7 +53,10 @@ class Number:
         if isinstance(value, np.generic):
             value = value.item()
         if isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
+            try:
+                value = float(value)
+            except OverflowError as problem:
+                raise InputError(name, value, self.allowed()) from problem
         numbers = _concrete_reals(name, value, self.allowed())
         if numbers is not None and not self._holds(numbers):
             raise InputError(name, value, self.allowed())
@@ -63,7 +66,7 @@ class Number:
         real = ~np.isnan(v) if self.infinite else np.isfinite(v)
         inside = (v > self.above) | (self.above == -math.inf)
         inside &= (v >= self.at_least) & ((v < self.below) | (self.below == math.inf)) & (v <= self.at_most)
-        return bool(np.all(real & inside))
+        return v.size > 0 and bool(np.all(real & inside))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,10 +84,7 @@ class Matrix:
 
     def normalise(self, name: str, value: Any) -> Any:
         if isinstance(value, (list, tuple)) and not _holds_tracers(value):
-            try:
-                value = np.asarray(value, dtype=float)
-            except (TypeError, ValueError) as problem:
-                raise InputError(name, value, self.allowed()) from problem
+            value = _from_list(name, value, self.allowed())
         if not hasattr(value, "shape"):
             raise InputError(name, value, self.allowed())
         if self.shape[0] == 1 and value.shape == self.shape[1:]:
@@ -94,9 +94,8 @@ class Matrix:
         numbers = _concrete_reals(name, value, self.allowed())
         if numbers is None:
             return value
-        scale = np.max(np.abs(numbers), initial=0.0)
-        skewed = self.symmetric and not np.allclose(numbers, np.swapaxes(numbers, -1, -2), rtol=0, atol=1e-6 * scale)
-        if not np.all(np.isfinite(numbers)) or skewed:
+        finite = numbers.size > 0 and bool(np.all(np.isfinite(numbers)))
+        if not finite or (self.symmetric and not _is_symmetric(numbers)):
             raise InputError(name, value, self.allowed())
         return value
 
@@ -225,6 +224,8 @@ def check_unbatched(name: str, tree: Any) -> None:
     for field in dataclasses.fields(tree):
         value, rule = getattr(tree, field.name), declared.get(field.name)
         expected = rule.shape if isinstance(rule, Matrix) else () if isinstance(rule, Number) else None
+        if rule is None and not dataclasses.is_dataclass(value):
+            expected = ()  # a State's component
         if expected is not None and np.shape(value) != expected:
             allowed = f"of shape {expected}; batches go through jax.vmap"
             raise InputError(f"{name}.{field.name}", f"array of shape {np.shape(value)}", allowed)
@@ -236,6 +237,22 @@ def cast(tree: T, dtype: Any) -> T:
     import jax.numpy as jnp
 
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=dtype), tree)
+
+
+def _from_list(name: str, value: Any, allowed: str) -> np.ndarray[Any, Any]:
+    """A nested list of Python numbers as a float array."""
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiu":  # not text, booleans, complex numbers, or an uneven nesting
+            raise ValueError
+        return array.astype(np.float64)
+    except (TypeError, ValueError, OverflowError) as problem:
+        raise InputError(name, value, allowed) from problem
+
+
+def _is_symmetric(matrices: np.ndarray[Any, Any]) -> bool:
+    difference = np.abs(matrices - np.swapaxes(matrices, -1, -2))
+    return bool(np.max(difference) <= 1e-6 * np.max(np.abs(matrices)))
 
 
 def _holds_tracers(value: Any) -> bool:

@@ -20,6 +20,8 @@ _SETS: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "rest": {name: (getattr(HANGING, name), 0.0) for name in NAMES},
 }
 
+_MOST = 10**8  # 3 GB of float64
+
 START_SETS = tuple(_SETS)
 """Names that `sample_starts` knows."""
 
@@ -34,14 +36,16 @@ def sample_starts(name: str, count: int, *, seed: int, dtype: Any = np.float64) 
     A larger count with the same seed begins with the same starts.
 
     Raises:
-      InputError: an unknown set, a count below 1, or a negative seed.
+      InputError: an unknown set, a count outside 1 to 10^8, a negative seed, or a dtype that is no float.
     """
-    if name not in _SETS:
+    if not isinstance(name, str) or name not in _SETS:
         raise InputError("starts", name, "one of " + ", ".join(_SETS))
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise InputError("count", count, "a whole number, at least 1")
+    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= _MOST:
+        raise InputError("count", count, f"a whole number, at least 1 and at most {_MOST}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise InputError("seed", seed, "a whole number, at least 0")
+    if not any(dtype is kind or dtype == np.dtype(kind) for kind in (np.float32, np.float64)):
+        raise InputError("dtype", dtype, "float32 or float64")
     unit = np.random.default_rng(seed).uniform(-1.0, 1.0, size=(count, len(NAMES)))
     columns = (centre + half * unit[:, i] for i, (centre, half) in enumerate(_SETS[name][n] for n in NAMES))
     return State(*(column.astype(dtype) for column in columns))

@@ -55,6 +55,15 @@ HANGING = State(0.0, 0.0, math.pi, 0.0)
 """Hanging at rest in the middle of the track."""
 
 
+RUNAWAY_LIMIT = 1e3
+"""Bound on |x| [m], |x_dot| [m/s] and |theta_dot| [rad/s], far outside what 12 V can do in the protocol's 20 s."""
+
+ANGLE_LIMIT = 1e5
+"""Bound on |theta| [rad]; up to there sine and cosine of it mean something in float32."""
+
+_LARGEST = {"x": RUNAWAY_LIMIT, "x_dot": RUNAWAY_LIMIT, "theta": ANGLE_LIMIT, "theta_dot": RUNAWAY_LIMIT}
+
+
 def checked_start(start: Any, field: str, *, batched: bool) -> tuple[State, Any]:
     """`start` as a State of JAX arrays of one dtype, and that dtype.
 
@@ -67,20 +76,20 @@ def checked_start(start: Any, field: str, *, batched: bool) -> tuple[State, Any]
     if not isinstance(start, State):
         raise InputError(field, start, "a cpjax.State(x, x_dot, theta, theta_dot)")
     dtypes = {}
-    for name in NAMES:
+    for name, unit in zip(NAMES, UNITS, strict=True):
         value = getattr(start, name)
         path = f"{field}.{name}"
         if isinstance(value, bool) or not (isinstance(value, (int, float)) or hasattr(value, "dtype")):
             raise InputError(path, value, "a real number or an array of them")
         if isinstance(value, (int, float)):
-            if not math.isfinite(value):
-                raise InputError(path, value, "finite")
+            if not abs(value) <= _LARGEST[name]:
+                raise InputError(path, value, f"finite, and within {_LARGEST[name]:g} {unit}")
         else:
             dtypes[name] = jnp.dtype(value.dtype) if is_traced(value) else jax.dtypes.canonicalize_dtype(value.dtype)
             if dtypes[name] not in (jnp.float32, jnp.float64):
                 raise InputError(path, f"array of dtype {value.dtype}", "of dtype float32 or float64")
-            if not is_traced(value) and not np.all(np.isfinite(np.asarray(value))):
-                raise InputError(path, value, "finite")
+            if not is_traced(value) and not np.all(np.abs(np.asarray(value)) <= _LARGEST[name]):
+                raise InputError(path, value, f"finite, and within {_LARGEST[name]:g} {unit}")
     if len(set(dtypes.values())) > 1:
         mixture = ", ".join(f"{name}: {dtype}" for name, dtype in dtypes.items())
         raise InputError(field, f"State with dtypes {mixture}", "of one dtype, float32 or float64, throughout")

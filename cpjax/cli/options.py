@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 from cpjax import io, paper
 from cpjax.controllers import AngleGate, AngleRateGate, EnergySwingUp, Hybrid, LyapunovGate, StateFeedback
 from cpjax.controllers.gates import Gate
-from cpjax.controllers.protocol import Controller
+from cpjax.controllers.protocol import Controller, as_controller
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor
 from cpjax.pytree import Number, rules
@@ -77,7 +77,7 @@ CONTROLLER_OPTIONS = [
     Option("controller", "gate", "where the regulator takes over (default angle)", choices=tuple(_GATES)),
     *_numbers_of("controller", AngleRateGate),
     *_numbers_of("controller", LyapunovGate, ["level"]),
-    Option("controller", "reference_x", "where the regulator holds the cart [m]", float),
+    Option("controller", "reference_x", "where the regulator holds the cart [m]; metrics stay about 0", float),
 ]
 
 START_OPTIONS = [
@@ -163,6 +163,8 @@ def _checked_value(field: str, value: Any, option: Option) -> Any:
     for one in value if several else [value]:
         if isinstance(one, bool) or not isinstance(one, python_types):
             raise InputError(field, value, words)
+        if option.type is float and not abs(one) < 1e300 and not isinstance(one, float):
+            raise InputError(field, value, "a number that fits a float")
         if option.choices is not None and one not in option.choices:
             raise InputError(field, value, "one of " + ", ".join(option.choices))
     return value
@@ -191,10 +193,12 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
     if file is not None:
         if changes:
             raise InputError("controller", file, "alone, without " + ", ".join(changes))
-        controller = io.load(file)
-        if not isinstance(controller, Controller):
-            raise InputError("controller", file, "a file that holds a controller")
-        return controller
+        try:
+            return as_controller(io.load(file))
+        except InputError as problem:
+            if problem.field != "controller":
+                raise
+            raise InputError("controller", file, "a file that holds a controller or a law") from problem
     name = changes.pop("law", "corrected-centred")
     law = paper.LAWS[name](plant)
     law_changes = {key: changes.pop(key) for key in list(changes) if key in rules(EnergySwingUp)}

@@ -28,7 +28,7 @@ def run(given: argparse.Namespace) -> int:
     page = Page(
         "Swing-up at 12 volts",
         "A student paper swings a pendulum up with an energy law and catches it with LQR or pole placement. "
-        "Here are its controllers, as printed and as corrected, run from thousands of starts.",
+        "Here are its controllers, as printed and as corrected, run from many starts.",
     )
     page.section("What was run")
     page.text(
@@ -42,7 +42,7 @@ def run(given: argparse.Namespace) -> int:
         page.text(sentence)
     figure = success_rates(rows)
     save_figure(given.out / "success.png", figure)
-    page.picture(png(figure), "Share of starts caught, with 95 % intervals: what decides is the swing-up law.")
+    page.picture(png(figure), "Share of starts caught by each law, plant and regulator, with 95 % intervals.")
     page.table(HEADER, [cells(row) for row in rows], text_columns=4)
     page.note(
         "Settling, travel, effort and variation are over the successful runs, the peak voltage over all. "
@@ -55,10 +55,15 @@ def run(given: argparse.Namespace) -> int:
     page.section("How to get this page again")
     page.text(
         f"`cpjax report --starts {setting.starts} --count {setting.count} --seed {setting.seed} "
-        f"--duration {setting.duration:g} --dt {setting.dt:g}` with cpjax {__version__}."
+        f"--duration {_shortest(setting.duration)} --dt {_shortest(setting.dt)}` with cpjax {__version__}."
     )
     path = given.out / "report.html"
     page.write(path)
     print_rows(rows)
     print(f"wrote {path}")
     return 0
+
+
+def _shortest(seconds: float) -> str:
+    """The number in as few digits as name it exactly."""
+    return f"{seconds:g}" if float(f"{seconds:g}") == seconds else repr(seconds)

@@ -1,8 +1,8 @@
 """Linear state feedback."""
 
 from cpjax.numeric.trigonometry import wrap_angle
-from cpjax.pytree import Array, Scalar, matrix, part, pytree
-from cpjax.state import NAMES, UPRIGHT, State
+from cpjax.pytree import Array, Number, Scalar, matrix, part, pytree
+from cpjax.state import NAMES, UNITS, UPRIGHT, State
 
 
 @pytree
@@ -14,6 +14,14 @@ class StateFeedback:
 
     K: Array = matrix((1, 4), "V per unit of state", "gain, u = -K (s - s_ref)")
     reference: State = part("the state to hold, a State", *NAMES, default=UPRIGHT)
+
+    def __post_init__(self) -> None:
+        # A State is not checked when it is constructed; as a parameter of a law it has to be.
+        values = (
+            Number(unit, name).normalise(f"StateFeedback.reference.{name}", getattr(self.reference, name))
+            for name, unit in zip(NAMES, UNITS, strict=True)
+        )
+        object.__setattr__(self, "reference", State(*values))
 
     def voltage(self, state: State) -> Scalar:
         """Demanded voltage [V]."""

@@ -68,8 +68,9 @@ def as_controller(controller: Controller | Law) -> Controller:
     Raises:
       InputError: it is neither.
     """
-    if isinstance(controller, Controller):
-        return controller
-    if isinstance(controller, Law):
-        return SingleLaw(controller)
+    if not isinstance(controller, type):  # a class has the methods too, but no parameters
+        if isinstance(controller, Controller):
+            return controller
+        if isinstance(controller, Law):
+            return SingleLaw(controller)
     raise InputError("controller", controller, "a controller such as cpjax.Hybrid, or a law with voltage(state)")

@@ -6,6 +6,9 @@ from statistics import NormalDist
 from cpjax.errors import InputError
 
 
+_MOST = 2**53  # whole numbers up to here are floats without rounding
+
+
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Two-sided Wilson score interval of a proportion (Wilson, 1927): `(low, high)` within [0, 1].
 
@@ -13,6 +16,8 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
       InputError: `trials` below 1, or `successes` outside 0..trials.
     """
     _check_counts(successes, trials)
+    if isinstance(confidence, bool) or not isinstance(confidence, (int, float)) or not 0 < confidence < 1:
+        raise InputError("confidence", confidence, "a number above 0 and below 1")
     z = NormalDist().inv_cdf(0.5 + confidence / 2)
     p = successes / trials
     centre = p + z * z / (2 * trials)
@@ -37,7 +42,7 @@ def two_proportion_p_value(successes_a: int, trials_a: int, successes_b: int, tr
 
 
 def _check_counts(successes: int, trials: int) -> None:
-    if trials < 1:
-        raise InputError("trials", trials, "a whole number, at least 1")
-    if not 0 <= successes <= trials:
+    if isinstance(trials, bool) or not isinstance(trials, int) or not 1 <= trials <= _MOST:
+        raise InputError("trials", trials, f"a whole number, at least 1 and at most {_MOST}")
+    if isinstance(successes, bool) or not isinstance(successes, int) or not 0 <= successes <= trials:
         raise InputError("successes", successes, f"a whole number from 0 to trials = {trials}")

@@ -11,7 +11,7 @@ from cpjax.show.figures import DESIGN_NAMES, paper_figures
 from cpjax.study.reproduction import Setting, representative, trajectory
 
 SHOWN = (("as-printed", "appendix", 10.0), ("corrected-centred", "appendix", 10.0))
-"""Law, plant and shown time [s] of the pictures that stand for the paper's Figures 3 to 6."""
+"""Law, plant and longest shown time [s] of the pictures that stand for the paper's Figures 3 to 6."""
 
 HEADER = (
     "law",
@@ -23,7 +23,7 @@ HEADER = (
     "settling mean [s]",
     "median [s]",
     "travel mean [m]",
-    "effort mean [V² s]",
+    "effort mean [V^2 s]",
     "variation mean [V]",
     "peak [V]",
 )
@@ -66,7 +66,9 @@ def pictures(setting: Setting) -> list[tuple[str, Figure, str]]:
         title = f"law {law}, printed gains, {plant} plant"
         outcome = "; ".join(f"{DESIGN_NAMES[d]} {_outcome(run.metrics)}" for d, run in runs.items())
         caption = f"Our runs in the places of the paper's Figures 3 to 6 ({title}). Starts: {words}. Result: {outcome}."
-        results.append((f"figures-3-6-{law}-{plant}", paper_figures(runs, title, until, limit), caption))
+        results.append(
+            (f"figures-3-6-{law}-{plant}", paper_figures(runs, title, min(until, setting.duration), limit), caption)
+        )
     return results
 
 

@@ -9,10 +9,11 @@ class Flag(enum.IntFlag):
     """Bits of `Trajectory.flag` and `Metrics.flag`; 0 is a clean run."""
 
     RUNAWAY = 1
-    """A rate or the cart's position left +-RUNAWAY_LIMIT. The state was held at its last value inside."""
+    """The state left, or was about to leave, the bounds of `cpjax.state` (RUNAWAY_LIMIT, ANGLE_LIMIT). It was held at
+    its last value inside."""
 
     NON_FINITE = 2
-    """The next state was NaN or infinite. The state was held at its last finite value."""
+    """A parameter or the next state was NaN or infinite. The state was held at its last finite value."""
 
     CHATTERING = 4
     """The mode changed at CHATTER_LENGTH control instants in a row. The run went on; a gate wants hysteresis."""
@@ -20,9 +21,6 @@ class Flag(enum.IntFlag):
 
 STOPPED = int(Flag.RUNAWAY | Flag.NON_FINITE)
 """Flags after which the state is held, and the run is no success."""
-
-RUNAWAY_LIMIT = 1e3
-"""Bound on |x| [m], |x_dot| [m/s] and |theta_dot| [rad/s], far outside what 12 V can do in the protocol's 20 s."""
 
 CHATTER_LENGTH = 8
 

@@ -17,26 +17,32 @@ Acceleration: TypeAlias = Callable[[Tree, Tree], Tree]
 
 
 class Integrator(Protocol):
-    """One step: from (q, v) at t to (q, v) at t + dt."""
+    """One step: from (q, v) at t to (q, v) at t + dt. `first`, if given, is acceleration(q, v), known to the caller."""
 
-    def __call__(self, acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar) -> tuple[Tree, Tree]: ...
+    def __call__(
+        self, acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar, first: Tree | None = None
+    ) -> tuple[Tree, Tree]: ...
 
 
-def euler(acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar) -> tuple[Tree, Tree]:
+def euler(acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar, first: Tree | None = None) -> tuple[Tree, Tree]:
     """Explicit Euler, order 1. Adds energy to an oscillation; here for comparison."""
-    return _add(q, (dt, v)), _add(v, (dt, acceleration(q, v)))
+    a1 = acceleration(q, v) if first is None else first
+    return _add(q, (dt, v)), _add(v, (dt, a1))
 
 
-def semi_implicit_euler(acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar) -> tuple[Tree, Tree]:
+def semi_implicit_euler(
+    acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar, first: Tree | None = None
+) -> tuple[Tree, Tree]:
     """Semi-implicit (symplectic) Euler, order 1: positions advance with the new velocities."""
-    v = _add(v, (dt, acceleration(q, v)))
+    a1 = acceleration(q, v) if first is None else first
+    v = _add(v, (dt, a1))
     return _add(q, (dt, v)), v
 
 
-def rk4(acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar) -> tuple[Tree, Tree]:
+def rk4(acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar, first: Tree | None = None) -> tuple[Tree, Tree]:
     """The classical Runge-Kutta method, order 4, with the rows of q' = v eliminated."""
     half = 0.5 * dt
-    a1 = acceleration(q, v)
+    a1 = acceleration(q, v) if first is None else first
     a2 = acceleration(_add(q, (half, v)), _add(v, (half, a1)))
     a3 = acceleration(_add(q, (half, v), (half * half, a1)), _add(v, (half, a2)))
     a4 = acceleration(_add(q, (dt, v), (half * dt, a2)), _add(v, (dt, a3)))

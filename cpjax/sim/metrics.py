@@ -124,7 +124,8 @@ class ProtocolMetrics:
         return _Memory(
             entered=jnp.where(inside, jnp.minimum(memory.entered, sample.time), math.inf),
             cart_travel=jnp.maximum(memory.cart_travel, travel),
-            effort=memory.effort + 0.5 * sample.elapsed * (first * first + last * last),
+            # The factors stand so that 0 s of a huge voltage is 0 and not 0 times infinity.
+            effort=memory.effort + 0.5 * (sample.elapsed * first * first + sample.elapsed * last * last),
             voltage_variation=memory.voltage_variation + drift + jump,
             peak_voltage=jnp.maximum(memory.peak_voltage, jnp.abs(sample.voltage)),
             peak_cart_acceleration=jnp.maximum(memory.peak_cart_acceleration, jnp.abs(sample.cart_acceleration)),

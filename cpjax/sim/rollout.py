@@ -6,7 +6,7 @@ one compiled scan: at each step `_observe` reads the controller and takes a samp
 
 import functools
 import math
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,11 @@ from cpjax.errors import InputError
 from cpjax.numeric.trigonometry import sin_cos
 from cpjax.plant import CartPole
 from cpjax.pytree import cast, check_unbatched, is_traced, pytree
-from cpjax.sim.flags import CHATTER_LENGTH, RUNAWAY_LIMIT, STOPPED, Flag
+from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, Flag
 from cpjax.sim.integrators import INTEGRATORS
 from cpjax.sim.metrics import Fold, ProtocolMetrics, Sample
-from cpjax.sim.stepper import step_continuous, step_held
-from cpjax.state import State, checked_start
+from cpjax.sim.stepper import Pair, step_continuous, step_held
+from cpjax.state import ANGLE_LIMIT, RUNAWAY_LIMIT, State, checked_start
 
 Clock: TypeAlias = Literal["continuous", "sampled"]
 Switching: TypeAlias = Literal["per_step"]
@@ -84,7 +84,9 @@ def rollout(
     Raises:
       InputError: bad arguments, named; never because of what the simulation does (see `Trajectory.flag`).
     """
-    settings = _check_settings(duration, dt, clock, control_period, switching, integrator, save_every)
+    if save_every is None:
+        raise InputError("save_every", save_every, "a whole number of steps, at least 1; cpjax.measure saves nothing")
+    settings = check_settings(duration, dt, clock, control_period, switching, integrator, save_every)
     start, dtype = checked_start(start, "start", batched=False)
     arguments = _cast_arguments(plant, controller, metrics, dt, dtype)
     trajectory: Trajectory = _simulate(start, *arguments, settings=settings)
@@ -105,7 +107,7 @@ def measure(
     metrics: Fold | None = None,
 ) -> Any:
     """What `rollout(...).metrics` would be, without storing a trajectory. Arguments and errors as for `rollout`."""
-    settings = _check_settings(duration, dt, clock, control_period, switching, integrator, None)
+    settings = check_settings(duration, dt, clock, control_period, switching, integrator, None)
     start, dtype = checked_start(start, "start", batched=False)
     return _simulate(start, *_cast_arguments(plant, controller, metrics, dt, dtype), settings=settings)
 
@@ -140,17 +142,20 @@ def _simulate(
     none = jnp.zeros_like(start.x, dtype=jnp.int32)
     mode = controller.start_mode(start)
     voltage = plant.motor.saturate(controller.mode_voltage(start, mode))
-    loop = _Loop(start, mode, voltage, none, none)
-    _, first = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
+    unknown = [jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves((start, plant, controller))]
+    flag = jnp.where(jnp.any(jnp.stack(unknown)), int(Flag.NON_FINITE), none)
+    loop = _Loop(start, mode, voltage, flag, none)
+    _, first, _ = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
 
     def body(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], Sample | None]:
         loop, memory = carry
-        loop, sample = _observe(plant, controller, loop, index, dt, settings)
+        loop, sample, rates = _observe(plant, controller, loop, index, dt, settings)
         memory = fold.update(memory, sample)
-        return (_advance(plant, controller, loop, dt, settings), memory), (sample if every == 1 else None)
+        loop = _advance(plant, controller, loop, rates, dt, settings)
+        return (loop, memory), (sample if every == 1 else None)
 
     def block(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], Sample]:
-        _, sample = _observe(plant, controller, carry[0], index, dt, settings)
+        _, sample, _ = _observe(plant, controller, carry[0], index, dt, settings)
         carry, _ = lax.scan(body, carry, index + jnp.arange(every))
         return carry, sample
 
@@ -160,7 +165,7 @@ def _simulate(
     else:
         carry, samples = lax.scan(block, carry, jnp.arange(0, steps, every))
     loop, memory = carry
-    _, last = _observe(plant, controller, loop, jnp.asarray(steps), dt, settings)
+    _, last, _ = _observe(plant, controller, loop, jnp.asarray(steps), dt, settings)
     result = fold.finish(fold.update(memory, last), last)
     if samples is None:
         return result
@@ -178,8 +183,9 @@ def _simulate(
 
 def _observe(
     plant: CartPole, controller: Controller, loop: _Loop, index: jax.Array, dt: jax.Array, settings: _Settings
-) -> tuple[_Loop, Sample]:
-    """Reads the controller at step `index`, if that is a control instant, and takes a sample."""
+) -> tuple[_Loop, Sample, Pair]:
+    """Reads the controller at step `index`, if that is a control instant, takes a sample, and hands the accelerations
+    at this instant on to `_advance`, whose first stage they are."""
     state = loop.state
     mode = controller.next_mode(state, loop.mode)
     voltage = plant.motor.saturate(controller.mode_voltage(state, mode))
@@ -196,7 +202,7 @@ def _observe(
     flag = loop.flag | jnp.where(changes >= CHATTER_LENGTH, int(Flag.CHATTERING), 0)
     sin, cos = sin_cos(state.theta)
     force = plant.motor.force(voltage, state.x_dot)
-    x_ddot, _ = plant.acceleration(sin, cos, (state.x_dot, state.theta_dot), force)
+    rates = plant.acceleration(sin, cos, (state.x_dot, state.theta_dot), force)
     sample = Sample(
         time=index.astype(dt.dtype) * dt,
         elapsed=jnp.where(index > 0, dt, 0.0),
@@ -204,27 +210,37 @@ def _observe(
         voltage=voltage,
         voltage_before=voltage_before,
         mode=mode,
-        cart_acceleration=jnp.asarray(x_ddot),
+        cart_acceleration=jnp.asarray(rates[0]),
         flag=flag,
     )
-    return _Loop(state, mode, voltage, flag, changes), sample
+    return _Loop(state, mode, voltage, flag, changes), sample, rates
 
 
-def _advance(plant: CartPole, controller: Controller, loop: _Loop, dt: jax.Array, settings: _Settings) -> _Loop:
-    """Integrates one step. A run that is flagged as runaway or non-finite is held where it last was inside."""
-    method = INTEGRATORS[settings.integrator]
+def _advance(
+    plant: CartPole, controller: Controller, loop: _Loop, rates: Pair, dt: jax.Array, settings: _Settings
+) -> _Loop:
+    """Integrates one step. A run that would leave the bounds, or become non-finite, is held where it is and flagged.
+
+    A derivative in reverse passes through both branches of a `where`, and 0 times an infinity of the branch not taken
+    is NaN. So a step that is about to go wrong (told by an Euler step) is not taken from where it would: it is taken
+    from upright rest, where all is finite, and dropped.
+    """
+    state, method = loop.state, INTEGRATORS[settings.integrator]
+    stopped = (loop.flag & STOPPED) != 0
+    ahead = jnp.maximum(jnp.abs(state.x_dot + dt * rates[0]), jnp.abs(state.theta_dot + dt * rates[1]))
+    going = ~stopped & (ahead <= RUNAWAY_LIMIT)
+    safe, safe_rates = jax.tree.map(lambda value: jnp.where(going, value, 0.0), (state, rates))
     if settings.clock == "continuous":
-        after = step_continuous(plant, controller, method, loop.state, loop.mode, dt)
+        after = step_continuous(plant, controller, method, safe, loop.mode, dt, safe_rates)
     else:
-        after = step_held(plant, method, loop.state, loop.voltage, dt)
-    finite = jnp.isfinite(after.x + after.x_dot + after.theta + after.theta_dot)
+        after = step_held(plant, method, safe, jnp.where(going, loop.voltage, 0.0), dt, safe_rates)
     fastest = jnp.maximum(jnp.abs(after.x_dot), jnp.abs(after.theta_dot))
-    bounded = jnp.maximum(jnp.abs(after.x), fastest) <= RUNAWAY_LIMIT
-    flag = loop.flag | jnp.where(finite, jnp.where(bounded, 0, int(Flag.RUNAWAY)), int(Flag.NON_FINITE))
-    stopped = (flag & STOPPED) != 0
-    # The branch not taken contributes nothing to the derivative: a stopped run no longer depends on anything new.
-    state = jax.tree.map(lambda old, new: jnp.where(stopped, old, new), loop.state, after)
-    return loop._replace(state=state, flag=flag)
+    within = (jnp.maximum(jnp.abs(after.x), fastest) <= RUNAWAY_LIMIT) & (jnp.abs(after.theta) <= ANGLE_LIMIT)
+    good = going & within
+    finite = jnp.isfinite(ahead + after.x + after.x_dot + after.theta + after.theta_dot)
+    reason = jnp.where(finite, int(Flag.RUNAWAY), int(Flag.NON_FINITE))
+    state = jax.tree.map(lambda old, new: jnp.where(good, new, old), state, after)
+    return loop._replace(state=state, flag=loop.flag | jnp.where(stopped | good, 0, reason))
 
 
 def _cast_arguments(
@@ -233,6 +249,8 @@ def _cast_arguments(
     if not isinstance(plant, CartPole):
         raise InputError("plant", plant, "a cpjax.CartPole")
     fold = ProtocolMetrics() if fold is None else fold
+    if isinstance(fold, type) or not all(callable(getattr(fold, name, None)) for name in ("init", "update", "finish")):
+        raise InputError("metrics", fold, "a fold, such as cpjax.ProtocolMetrics()")
     controller = as_controller(controller)
     for name, part in (("plant", plant), ("controller", controller), ("metrics", fold)):
         check_unbatched(name, part)
@@ -244,25 +262,30 @@ def _cast_arguments(
     )
 
 
-def _check_settings(
+def check_settings(
     duration: Any,
     dt: Any,
-    clock: Any,
+    clock: Clock,
     control_period: Any,
     switching: Any,
     integrator: Any,
     save_every: Any,
 ) -> _Settings:
+    """The settings of a rollout; `save_every` None for metrics only.
+
+    Raises:
+      InputError: as `rollout` does.
+    """
     dt = _positive_seconds("dt", dt)
     duration = _positive_seconds("duration", duration)
     if dt > duration:
         raise InputError("dt", dt, f"at most the duration, {duration:g} s")
     steps = _whole_steps("duration", duration, dt)
-    if clock not in ("continuous", "sampled"):
+    if not isinstance(clock, str) or clock not in get_args(Clock):
         raise InputError("clock", clock, "continuous or sampled")
-    if switching != "per_step":
+    if not isinstance(switching, str) or switching != "per_step":
         raise InputError("switching", switching, "per_step")
-    if integrator not in INTEGRATORS:
+    if not isinstance(integrator, str) or integrator not in INTEGRATORS:
         raise InputError("integrator", integrator, "one of " + ", ".join(INTEGRATORS))
     steps_per_control = 1
     if control_period is not None:
@@ -282,11 +305,11 @@ def _check_settings(
 
 def _positive_seconds(field: str, value: Any) -> float:
     allowed = "a finite number above 0 [s], known when the rollout is compiled"
-    if is_traced(value) or isinstance(value, bool):
+    if is_traced(value) or isinstance(value, (bool, str)):
         raise InputError(field, value, allowed)
     try:
         seconds = float(value)
-    except (TypeError, ValueError) as problem:
+    except (TypeError, ValueError, OverflowError) as problem:
         raise InputError(field, value, allowed) from problem
     if not (math.isfinite(seconds) and seconds > 0):
         raise InputError(field, value, allowed)
@@ -295,9 +318,9 @@ def _positive_seconds(field: str, value: Any) -> float:
 
 def _whole_steps(field: str, seconds: float, dt: float) -> int:
     """How many steps of `dt` make `seconds`; decimal fractions such as 0.3 / 0.1 count as whole."""
+    if not seconds / dt < 2**31:
+        raise InputError(field, seconds, f"fewer than 2^31 steps of dt = {dt:g} s")
     steps = round(seconds / dt)
     if abs(seconds / dt - steps) > 1e-6 * steps:
         raise InputError(field, seconds, f"a whole multiple of dt = {dt:g} s")
-    if steps >= 2**31:
-        raise InputError(field, seconds, f"fewer than 2^31 steps of dt = {dt:g} s")
     return steps

@@ -12,7 +12,7 @@ import numpy as np
 from cpjax import io, paper
 from cpjax.errors import InputError
 from cpjax.sim.metrics import Metrics
-from cpjax.sim.rollout import Trajectory, rollout
+from cpjax.sim.rollout import Trajectory, check_settings, rollout
 from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
 from cpjax.state import HANGING, State
@@ -71,9 +71,10 @@ def reproduce(
     Raises:
       InputError: a setting outside its range, or a `path` that cannot be written.
     """
+    check_settings(setting.duration, setting.dt, "sampled", None, "per_step", "rk4", None)
+    starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
     todo = variants()
     rows = _resume(path, setting) if path is not None else []
-    starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
     for variant in todo[len(rows) :]:
         if progress is not None:
             progress(len(rows), len(todo), f"{variant.law}, {variant.plant}, {variant.design}, {variant.gains}")
@@ -130,4 +131,9 @@ def _resume(path: Path, setting: Setting) -> list[dict[str, Any]]:
         return []  # something else, or broken: it is overwritten by the first row
     expected = _document(setting, [])
     same = all(document.get(key) == expected[key] for key in ("what", "versions", "setting"))
-    return list(document["rows"]) if same and not document.get("complete", True) else []
+    rows = document.get("rows")
+    if not same or document.get("complete", True) or not isinstance(rows, list) or len(rows) > len(variants()):
+        return []
+    expected_names = [dataclasses.asdict(variant) for variant in variants()[: len(rows)]]
+    found = [{key: dict(row).get(key) for key in names} for row, names in zip(rows, expected_names, strict=True)]
+    return rows if found == expected_names else []
