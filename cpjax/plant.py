@@ -17,10 +17,11 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from cpjax.errors import InputError
 from cpjax.numeric.trigonometry import sin_cos
-from cpjax.pytree import Number, Scalar, is_traced, number, part, pytree
+from cpjax.pytree import Number, Scalar, check, is_traced, number, part, pytree
 from cpjax.state import HANGING, UPRIGHT, State
 
 
@@ -211,6 +212,7 @@ def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | Stat
     """
     if not isinstance(plant, CartPole):
         raise InputError("plant", plant, "a cpjax.CartPole")
+    check("plant", plant)
     named = {"upright": UPRIGHT, "hanging": HANGING}
     if isinstance(equilibrium, str):
         if equilibrium not in named:
@@ -227,9 +229,10 @@ def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | Stat
     voltage = jnp.zeros((), dtype=dtype)
     A, B = jax.jacfwd(field, argnums=(0, 1))(vector, voltage)
     drift = field(vector, voltage)
-    if not is_traced(A) and not bool(jnp.all(jnp.isfinite(A)) & jnp.all(jnp.isfinite(B))):
-        raise InputError("plant", plant, "one with a finite linear model; no gain can be computed for this one")
-    # What A makes of a displacement by 1e-6: more than float32 misses pi by, less than a linear model would notice.
-    if not is_traced(drift) and not bool(jnp.max(jnp.abs(drift)) <= 1e-6 * jnp.max(jnp.abs(A))):  # NaN is refused
-        raise InputError("equilibrium", equilibrium, "a state at rest in which nothing accelerates")
+    if not is_traced(A) and not is_traced(drift):
+        if np.all(np.isfinite(vector)) and not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
+            raise InputError("plant", plant, "one with a finite linear model; no gain can be computed for this one")
+        # What A makes of a displacement by 1e-6: more than float32 misses pi by, less than a linear model would notice.
+        if not np.max(np.abs(drift)) <= 1e-6 * np.max(np.abs(A)):  # NaN is refused too
+            raise InputError("equilibrium", equilibrium, "a state at rest in which nothing accelerates")
     return LinearModel(A, B[:, None])

@@ -1,8 +1,9 @@
 """Frozen dataclasses that JAX can take apart, with units and ranges declared beside each field.
 
-A class decorated with `pytree` is an immutable dataclass whose numbers are JAX leaves and whose choices (`choice`) are
-static. What a user constructs is checked against the declared ranges; what JAX rebuilds is not, because JAX fills the
-leaves with tracers, `None`, axis numbers and zeros of an optimiser. The same declarations feed the command line's
+A class decorated with `pytree` is an immutable dataclass whose fields are JAX leaves or hold such classes; a choice,
+such as a gate's kind, is a class of its own. What a user constructs is checked against the declared ranges; what JAX
+rebuilds is not, because JAX fills the leaves with tracers, `None`, axis numbers and zeros of an optimiser. A rollout
+checks what it is given once more. The same declarations feed the command line's
 options, the files' keys and the documentation, so that a parameter is described in one place.
 """
 
@@ -12,6 +13,7 @@ from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from cpjax.errors import InputError
@@ -65,7 +67,9 @@ class Number:
     def _holds(self, v: np.ndarray) -> bool:
         real = ~np.isnan(v) if self.infinite else np.isfinite(v)
         inside = (v > self.above) | (self.above == -math.inf)
-        inside &= (v >= self.at_least) & ((v < self.below) | (self.below == math.inf)) & (v <= self.at_most)
+        # A closed end, such as pi, is still allowed after a rounding to float32.
+        inside &= (v >= self.at_least - 1e-6 * abs(self.at_least)) & (v <= self.at_most + 1e-6 * abs(self.at_most))
+        inside &= (v < self.below) | (self.below == math.inf)
         return v.size > 0 and bool(np.all(real & inside))
 
 
@@ -83,8 +87,8 @@ class Matrix:
         return f"a {kind} array of shape {self.shape} [{self.unit}]"
 
     def normalise(self, name: str, value: Any) -> Any:
-        if isinstance(value, (list, tuple)) and not _holds_tracers(value):
-            value = _from_list(name, value, self.allowed())
+        if isinstance(value, (list, tuple)):
+            value = jnp.asarray(value) if _holds_tracers(value) else _from_list(name, value, self.allowed())
         if not hasattr(value, "shape"):
             raise InputError(name, value, self.allowed())
         if self.shape[0] == 1 and value.shape == self.shape[1:]:
@@ -114,20 +118,7 @@ class Part:
         return value
 
 
-@dataclasses.dataclass(frozen=True)
-class Choice:
-    """Declaration of a static field: one of a few values; another value means another compilation."""
-
-    help: str
-    options: tuple[Any, ...]
-
-    def normalise(self, name: str, value: Any) -> Any:
-        if value not in self.options:
-            raise InputError(name, value, "one of " + ", ".join(map(str, self.options)))
-        return value
-
-
-Rule: TypeAlias = Number | Matrix | Part | Choice
+Rule: TypeAlias = Number | Matrix | Part
 
 
 def number(unit: str, help: str, *, default: Any = dataclasses.MISSING, **ends: Any) -> Any:
@@ -148,17 +139,12 @@ def part(help: str, *needs: str, default: Any = dataclasses.MISSING, default_fac
     return dataclasses.field(default=default, metadata=rule)
 
 
-def choice(help: str, *options: Any, default: Any = dataclasses.MISSING) -> Any:
-    """A static field, one of `options` (see `Choice`)."""
-    return dataclasses.field(default=default, metadata={_RULE: Choice(help, options)})
-
-
 def rules(cls: type) -> dict[str, Rule]:
     """The declarations of a `pytree` class, by field name, in order."""
     return {f.name: f.metadata[_RULE] for f in dataclasses.fields(cls) if _RULE in f.metadata}
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=False, field_specifiers=(number, matrix, part, choice))
+@dataclass_transform(frozen_default=True, kw_only_default=False, field_specifiers=(number, matrix, part))
 def pytree(cls: type[T]) -> type[T]:
     """Class decorator: frozen dataclass, registered with JAX, checked when a user constructs it.
 
@@ -184,22 +170,18 @@ def pytree(cls: type[T]) -> type[T]:
 
     # Equality stays identity: comparing fields that hold arrays has no single truth value.
     cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
-    declared = rules(cls)
     names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]  # a dataclass since the line above
-    static = [n for n in names if isinstance(declared.get(n), Choice)]
-    dynamic = [n for n in names if n not in static]
 
-    def flatten_with_keys(tree: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
-        leaves = [(jax.tree_util.GetAttrKey(n), getattr(tree, n)) for n in dynamic]
-        return leaves, tuple(getattr(tree, n) for n in static)
+    def flatten_with_keys(tree: Any) -> tuple[list[tuple[Any, Any]], None]:
+        return [(jax.tree_util.GetAttrKey(name), getattr(tree, name)) for name in names], None
 
-    def flatten(tree: Any) -> tuple[list[Any], tuple[Any, ...]]:
-        return [getattr(tree, n) for n in dynamic], tuple(getattr(tree, n) for n in static)
+    def flatten(tree: Any) -> tuple[list[Any], None]:
+        return [getattr(tree, name) for name in names], None
 
-    def unflatten(choices: tuple[Any, ...], leaves: Any) -> T:
+    def unflatten(_: None, leaves: Any) -> T:
         # Bypasses __init__ and with it the checks: JAX's leaves may be anything.
         tree = object.__new__(cls)
-        for name, value in (*zip(dynamic, leaves, strict=True), *zip(static, choices, strict=True)):
+        for name, value in zip(names, leaves, strict=True):
             object.__setattr__(tree, name, value)
         return tree
 
@@ -212,31 +194,47 @@ def is_traced(value: Any) -> bool:
     return isinstance(value, jax.core.Tracer)
 
 
-def check_unbatched(name: str, tree: Any) -> None:
-    """Refuses a component with a batch axis, which only `vmap` may take away.
+def check(name: str, tree: Any) -> None:
+    """Refuses a component that no rollout can run: JAX may have rebuilt it with anything.
 
     Raises:
-      InputError: a number that is an array, or a matrix with more axes than declared.
+      InputError: a leaf that is no number, a number or matrix with a batch axis (which only `vmap` may take away), or a
+        concrete one outside its declared range.
     """
-    if not dataclasses.is_dataclass(tree):
-        return
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if not (isinstance(leaf, (int, float)) or hasattr(leaf, "dtype")):
+            allowed = "a number; a class of your own is made a component by the decorator cpjax.pytree.pytree"
+            raise InputError(f"{name}{jax.tree_util.keystr(path)}", leaf, allowed)
+    if dataclasses.is_dataclass(tree):
+        _check_fields(name, tree)
+
+
+def _check_fields(name: str, tree: Any) -> None:
     declared = rules(type(tree))
     for field in dataclasses.fields(tree):
-        value, rule = getattr(tree, field.name), declared.get(field.name)
-        expected = rule.shape if isinstance(rule, Matrix) else () if isinstance(rule, Number) else None
-        if rule is None and not dataclasses.is_dataclass(value):
-            expected = ()  # a State's component
-        if expected is not None and np.shape(value) != expected:
-            allowed = f"of shape {expected}; batches go through jax.vmap"
-            raise InputError(f"{name}.{field.name}", f"array of shape {np.shape(value)}", allowed)
-        check_unbatched(f"{name}.{field.name}", value)
+        path, value, rule = f"{name}.{field.name}", getattr(tree, field.name), declared.get(field.name)
+        if dataclasses.is_dataclass(value):
+            _check_fields(path, value)
+        elif rule is not None or not declared:  # a State declares nothing and holds scalars
+            expected = rule.shape if isinstance(rule, Matrix) else ()
+            if np.shape(value) != expected:
+                allowed = f"of shape {expected}; batches go through jax.vmap"
+                raise InputError(path, f"array of shape {np.shape(value)}", allowed)
+            if rule is not None:
+                rule.normalise(path, value)
 
 
 def cast(tree: T, dtype: Any) -> T:
-    """`tree` with every leaf as a JAX array of `dtype`. Traced leaves are converted too, with their derivatives."""
-    import jax.numpy as jnp
+    """`tree` with every real leaf as a JAX array of `dtype`; integers and booleans stay what they are.
 
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=dtype), tree)
+    Traced leaves are converted too, with their derivatives.
+    """
+
+    def convert(leaf: Any) -> Any:
+        real = isinstance(leaf, float) or jnp.issubdtype(getattr(leaf, "dtype", int), jnp.floating)
+        return jnp.asarray(leaf, dtype=dtype) if real else leaf
+
+    return jax.tree.map(convert, tree)
 
 
 def _from_list(name: str, value: Any, allowed: str) -> np.ndarray[Any, Any]:
@@ -266,7 +264,7 @@ def _concrete_reals(name: str, value: Any, allowed: str) -> np.ndarray | None:
     if isinstance(value, float):
         return np.asarray(value)
     dtype = getattr(value, "dtype", None)
-    if dtype is None or not jax.numpy.issubdtype(dtype, np.floating):
+    if dtype is None or not jnp.issubdtype(dtype, jnp.floating):
         kind = f" of dtype {dtype}" if dtype is not None else ""
         raise InputError(name, f"{value}{kind}" if kind else value, f"{allowed}, of a floating-point dtype")
     return np.asarray(value, dtype=np.float64)

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from cpjax.errors import InputError
-from cpjax.pytree import Scalar, is_traced, pytree
+from cpjax.numeric.trigonometry import wrap_angle
+from cpjax.pytree import Number, Scalar, is_traced, pytree
 
 NAMES = ("x", "x_dot", "theta", "theta_dot")
 UNITS = ("m", "m/s", "rad", "rad/s")
@@ -46,6 +47,26 @@ class State:
     def from_vector(cls, vector: jax.Array) -> "State":
         """The state held in the last axis of an array (..., 4)."""
         return cls(*(vector[..., i] for i in range(4)))
+
+
+def deviation(state: State, reference: State) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """`state` less `reference`, in the order of `NAMES`, with the angle's difference taken modulo a turn."""
+    return (
+        state.x - reference.x,
+        state.x_dot - reference.x_dot,
+        wrap_angle(state.theta - reference.theta),
+        state.theta_dot - reference.theta_dot,
+    )
+
+
+def checked_reference(field: str, reference: State) -> State:
+    """A State that is a component's parameter, checked as its other parameters are.
+
+    Raises:
+      InputError: a component that is not a finite number.
+    """
+    components = zip(NAMES, UNITS, strict=True)
+    return State(*(Number(unit, n).normalise(f"{field}.{n}", getattr(reference, n)) for n, unit in components))
 
 
 UPRIGHT = State(0.0, 0.0, 0.0, 0.0)

@@ -63,7 +63,7 @@ NUMBERS = [
     (EnergySwingUp, "cart_stiffness", NOT_NEGATIVE, "1/s^2"),
     (EnergySwingUp, "cart_damping", NOT_NEGATIVE, "1/s"),
     (EnergySwingUp, "kick", ANY, "m/s^2"),
-    (EnergySwingUp, "kick_radius", "a finite number above 0 and at most 1.5708", "rad"),
+    (EnergySwingUp, "kick_radius", "a finite number at least 0.001 and at most 1.5708", "rad"),
     (paper.PrintedSwingUp, "energy_gain", ANY, "V/(J rad/s)"),
     (paper.CorrectedSwingUpAsVoltage, "energy_gain", ANY, "V/(J rad/s)"),
     (AngleGate, "half_angle", ANGLE, "rad"),
@@ -75,6 +75,7 @@ NUMBERS = [
     (LyapunovGate, "hysteresis", NOT_NEGATIVE, "1"),
     *((ProtocolMetrics, f, POSITIVE, u) for f, u in (("angle_band", "rad"), ("position_band", "m"))),
     (ProtocolMetrics, "hold", NOT_NEGATIVE, "s"),
+    (ProtocolMetrics, "reference_x", "a finite number", "m"),
     (ProtocolMetrics, "track_limit", "a number above 0", "m"),
 ]
 REQUIRED = {
@@ -99,7 +100,7 @@ def build(cls, **fields):
 def test_the_table_of_numbers_misses_no_field_of_any_class():
     listed = {(cls, field) for cls, field, _, _ in NUMBERS}
     for cls in {cls for cls, _ in listed}:
-        parts = {"motor", "model", "P"}
+        parts = {"motor", "model", "P", "reference"}
         assert {f.name for f in dataclasses.fields(cls)} - parts == {f for c, f in listed if c is cls}
 
 
@@ -125,7 +126,7 @@ def test_a_number_below_its_range_is_refused_and_its_ends_are_held(cls, field, a
         build(cls, **{field: -1})
     with refused(name, "array([ 1., -1.])", allowed):
         build(cls, **{field: np.array([1.0, -1.0])})
-    if "at least" in allowed:
+    if allowed == NOT_NEGATIVE:
         assert getattr(build(cls, **{field: 0}), field) == 0.0
     else:
         with refused(name, "0.0", allowed):

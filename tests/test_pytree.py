@@ -27,7 +27,7 @@ from cpjax import (
     paper,
     rollout,
 )
-from cpjax.pytree import choice, number, pytree
+from cpjax.pytree import number, pytree
 from cpjax.sim.rollout import _simulate
 
 PLANT = CartPole(
@@ -291,32 +291,18 @@ def test_a_jitted_function_of_the_plant_is_traced_once_for_all_plants():
 
 
 @pytree
-class _Switched:
-    """A class with every kind of field, as a user of the decorator would write it."""
+class _Limited:
+    """A class with a check of its own, as a user of the decorator would write it."""
 
     size: float = number("m", "how large", above=0.0)
-    kind: str = choice("which", "plain", "fancy", default="plain")
 
     def __post_init__(self):
-        if self.kind == "fancy" and not isinstance(self.size, jax.core.Tracer) and self.size > 2.0:
-            raise InputError("_Switched.size", self.size, "at most 2 if fancy")
-
-
-def test_a_choice_is_part_of_the_structure_and_not_a_leaf():
-    plain, fancy = _Switched(1.0), _Switched(1.0, "fancy")
-    assert jax.tree.leaves(fancy) == [1.0]
-    assert jax.tree.structure(plain) != jax.tree.structure(fancy)
-    assert jax.tree.map(lambda leaf: None, fancy).kind == "fancy"
-    assert jax.jit(lambda thing: thing.size * (2.0 if thing.kind == "fancy" else 1.0))(fancy) == 2.0
-
-
-def test_a_choice_outside_its_options_is_refused_with_the_options():
-    with pytest.raises(InputError, match=r"_Switched\.kind = 'odd': must be one of plain, fancy"):
-        _Switched(1.0, "odd")
+        if not isinstance(self.size, jax.core.Tracer) and self.size > 2.0:
+            raise InputError("_Limited.size", self.size, "at most 2 in all")
 
 
 def test_the_own_check_of_a_class_runs_after_the_declared_ones():
-    with pytest.raises(InputError, match=r"_Switched\.size = -1\.0: must be a finite number above 0 \[m\]"):
-        _Switched(-1.0, "fancy")
-    with pytest.raises(InputError, match=r"at most 2 if fancy"):
-        _Switched(3.0, "fancy")
+    with pytest.raises(InputError, match=r"_Limited\.size = -1\.0: must be a finite number above 0 \[m\]"):
+        _Limited(-1.0)
+    with pytest.raises(InputError, match=r"at most 2 in all"):
+        _Limited(3.0)

@@ -77,7 +77,7 @@ CONTROLLER_OPTIONS = [
     Option("controller", "gate", "where the regulator takes over (default angle)", choices=tuple(_GATES)),
     *_numbers_of("controller", AngleRateGate),
     *_numbers_of("controller", LyapunovGate, ["level"]),
-    Option("controller", "reference_x", "where the regulator holds the cart [m]; metrics stay about 0", float),
+    Option("controller", "reference_x", "where the cart is to be held (default 0) [m]", float),
 ]
 
 START_OPTIONS = [
@@ -163,7 +163,7 @@ def _checked_value(field: str, value: Any, option: Option) -> Any:
     for one in value if several else [value]:
         if isinstance(one, bool) or not isinstance(one, python_types):
             raise InputError(field, value, words)
-        if option.type is float and not abs(one) < 1e300 and not isinstance(one, float):
+        if option.type is float and isinstance(one, int) and abs(one) > 10**300:
             raise InputError(field, value, "a number that fits a float")
         if option.choices is not None and one not in option.choices:
             raise InputError(field, value, "one of " + ", ".join(option.choices))
@@ -207,15 +207,15 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
             raise InputError(key, law_changes[key], f"absent: the law {name} has no such term")
     # Every law is a dataclass; the protocol that annotates them does not say so.
     swing_up: Any = dataclasses.replace(law, **law_changes)  # type: ignore[type-var]
-    regulator = _build_regulator(changes, plant)
-    gate = _build_gate(changes, plant)
+    reference = State(changes.pop("reference_x", 0.0), 0.0, 0.0, 0.0)
+    regulator = _build_regulator(changes, plant, reference)
+    gate = _build_gate(changes, plant, reference)
     return Hybrid(swing_up, regulator, gate)
 
 
-def _build_regulator(changes: dict[str, Any], plant: CartPole) -> StateFeedback:
+def _build_regulator(changes: dict[str, Any], plant: CartPole, reference: State) -> StateFeedback:
     K = changes.pop("K", None)
     design, gains = changes.pop("design", None), changes.pop("gains", None)
-    reference = State(changes.pop("reference_x", 0.0), 0.0, 0.0, 0.0)
     if K is not None:
         if design is not None or gains is not None:
             raise InputError("gain", K, "absent where design or gains is given")
@@ -223,7 +223,7 @@ def _build_regulator(changes: dict[str, Any], plant: CartPole) -> StateFeedback:
     return StateFeedback(paper.regulator(design or "placement", gains or "printed", plant).K, reference)
 
 
-def _build_gate(changes: dict[str, Any], plant: CartPole) -> Gate:
+def _build_gate(changes: dict[str, Any], plant: CartPole, reference: State) -> Gate:
     name = changes.pop("gate", "angle")
     cls = _GATES[name]
     for key in changes:
@@ -233,7 +233,7 @@ def _build_gate(changes: dict[str, Any], plant: CartPole) -> Gate:
         if key in rules(cls) and key not in changes:
             raise InputError(key, None, f"given: the gate {name} needs it")
     if cls is LyapunovGate:
-        return LyapunovGate(paper.riccati_solution(plant), **changes)
+        return LyapunovGate(paper.riccati_solution(plant), reference=reference, **changes)
     return cls(**{"half_angle": paper.SWITCH_ANGLE, **changes})
 
 

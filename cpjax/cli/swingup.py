@@ -21,7 +21,7 @@ from cpjax.cli.options import (
 )
 from cpjax.errors import InputError
 from cpjax.sim.flags import describe
-from cpjax.sim.metrics import Metrics
+from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import rollout
 
 OPTIONS = [*START_OPTIONS, *RUN_OPTIONS, *PLANT_OPTIONS, *CONTROLLER_OPTIONS]
@@ -53,7 +53,8 @@ def run(given: argparse.Namespace) -> int:
     start = build_start(sections["start"], given.seed)
     settings = {"duration": 20.0, "dt": 0.002, "clock": "sampled", **sections["run"]}
     try:
-        trajectory = rollout(plant, controller, start, **settings)
+        fold = ProtocolMetrics(reference_x=sections["controller"].get("reference_x", 0.0))
+        trajectory = rollout(plant, controller, start, metrics=fold, **settings)
     except InputError as problem:
         raise InputError(problem.field.replace("start.", "start "), problem.value, problem.allowed) from problem
     metrics = trajectory.metrics

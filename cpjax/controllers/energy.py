@@ -38,7 +38,7 @@ class EnergySwingUp:
     cart_damping: Scalar = number("1/s", "damping of the cart", default=0.0, at_least=0.0)
     kick: Scalar = number("m/s^2", "acceleration hanging at rest; 0 for none", default=0.5)
     kick_radius: Scalar = number(
-        "rad", "swing amplitude beyond which the kick is gone", default=0.02, above=0.0, at_most=math.pi / 2
+        "rad", "swing amplitude beyond which the kick is gone", default=0.02, at_least=1e-3, at_most=math.pi / 2
     )
 
     def acceleration(self, state: State) -> Scalar:
@@ -59,7 +59,7 @@ class EnergySwingUp:
         _, cos = sin_cos(state.theta)
         weight = self.model.pole_mass * self.model.gravity * self.model.pole_length
         above_rest = 0.5 * self.model.pivot_inertia * state.theta_dot * state.theta_dot / weight + (1.0 + cos)
-        _, edge = sin_cos(self.kick_radius)
-        room = 1.0 - above_rest / (1.0 - edge)
+        half_edge, _ = sin_cos(0.5 * self.kick_radius)  # 1 - cos(edge) = 2 sin(edge / 2)^2, without cancellation
+        room = 1.0 - above_rest / (2.0 * half_edge * half_edge)
         inside = jnp.maximum(room, 0.0)  # its kink vanishes in the cube
         return jnp.where(self.kick == 0.0, 0.0, inside * inside * inside)

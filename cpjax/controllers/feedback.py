@@ -1,8 +1,7 @@
 """Linear state feedback."""
 
-from cpjax.numeric.trigonometry import wrap_angle
-from cpjax.pytree import Array, Number, Scalar, matrix, part, pytree
-from cpjax.state import NAMES, UNITS, UPRIGHT, State
+from cpjax.pytree import Array, Scalar, matrix, part, pytree
+from cpjax.state import NAMES, UPRIGHT, State, checked_reference, deviation
 
 
 @pytree
@@ -16,19 +15,9 @@ class StateFeedback:
     reference: State = part("the state to hold, a State", *NAMES, default=UPRIGHT)
 
     def __post_init__(self) -> None:
-        # A State is not checked when it is constructed; as a parameter of a law it has to be.
-        values = (
-            Number(unit, name).normalise(f"StateFeedback.reference.{name}", getattr(self.reference, name))
-            for name, unit in zip(NAMES, UNITS, strict=True)
-        )
-        object.__setattr__(self, "reference", State(*values))
+        object.__setattr__(self, "reference", checked_reference("StateFeedback.reference", self.reference))
 
     def voltage(self, state: State) -> Scalar:
         """Demanded voltage [V]."""
-        k = self.K
-        return -(
-            k[0, 0] * (state.x - self.reference.x)
-            + k[0, 1] * (state.x_dot - self.reference.x_dot)
-            + k[0, 2] * wrap_angle(state.theta - self.reference.theta)
-            + k[0, 3] * (state.theta_dot - self.reference.theta_dot)
-        )
+        s = deviation(state, self.reference)
+        return -(self.K[0, 0] * s[0] + self.K[0, 1] * s[1] + self.K[0, 2] * s[2] + self.K[0, 3] * s[3])

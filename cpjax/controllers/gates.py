@@ -1,8 +1,9 @@
 """Gates: where the regulator takes over, and where it lets go.
 
-A gate is a smooth function of the state, its margin: positive inside, zero on the boundary, negative outside. With
-hysteresis the boundary that ends regulation is wider than the one that begins it: its size (angle and rate, or level)
-is (1 + hysteresis) times as large. Angle gates are written in cos(theta), so that theta = pi is no boundary.
+A gate is a function of the state, its margin: positive inside, zero on the boundary, negative outside, and smooth near
+the boundary. With hysteresis the boundary that ends regulation is wider than the one that begins it: its size (angle
+and rate, or the level of the quadratic form) is (1 + hysteresis) times as large. Angle gates are written in cos(theta),
+so that theta = pi is no boundary; the Lyapunov gate's margin jumps there, but far below zero for any level of use.
 """
 
 import math
@@ -14,9 +15,9 @@ import numpy as np
 
 from cpjax.controllers.protocol import REGULATE
 from cpjax.errors import InputError
-from cpjax.numeric.trigonometry import sin_cos, wrap_angle
-from cpjax.pytree import Array, Scalar, is_traced, matrix, number, pytree
-from cpjax.state import State
+from cpjax.numeric.trigonometry import sin_cos
+from cpjax.pytree import Array, Scalar, is_traced, matrix, number, part, pytree
+from cpjax.state import NAMES, UPRIGHT, State, checked_reference, deviation
 
 
 class Gate(Protocol):
@@ -62,22 +63,26 @@ class AngleRateGate:
         """Unit 1."""
         size = _size(self.hysteresis, mode)
         _, cos = sin_cos(state.theta)
-        _, edge = sin_cos(self.half_angle * size)
+        half_edge, _ = sin_cos(0.5 * self.half_angle * size)  # 1 - cos(edge) = 2 sin(edge / 2)^2, without cancellation
         relative_rate = state.theta_dot / (self.rate * size)
-        return 1.0 - (1.0 - cos) / (1.0 - edge) - relative_rate * relative_rate
+        return 1.0 - (1.0 - cos) / (2.0 * half_edge * half_edge) - relative_rate * relative_rate
 
 
 @pytree
 class LyapunovGate:
-    """Open in a level set of s' P s, with theta wrapped: margin = level (1 + hysteresis, on the way out) - s' P s."""
+    """Open in a level set of s' P s, s the deviation from `reference`: margin = level - s' P s."""
 
     P: Array = matrix((4, 4), "per product of states", "symmetric weight, such as LQR's P", symmetric=True)
     level: Scalar = number("1", "s' P s up to which the gate is open", above=0.0)
     hysteresis: Scalar = number("1", "relative widening of the way out", default=0.0, at_least=0.0)
+    reference: State = part("the middle of the level set, a State", *NAMES, default=UPRIGHT)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "reference", checked_reference("LyapunovGate.reference", self.reference))
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
         """In the unit of `level`."""
-        s = (state.x, state.x_dot, wrap_angle(state.theta), state.theta_dot)
+        s = deviation(state, self.reference)
         # Written out, not as a matrix product: under vmap each component stays an array of its own.
         form = sum(self.P[i, j] * s[i] * s[j] for i in range(4) for j in range(4))
         return self.level * _size(self.hysteresis, mode) - form

@@ -30,5 +30,5 @@ class Hybrid:
         return jnp.where(self.gate.margin(state, mode) >= 0.0, REGULATE, SWING_UP).astype(jnp.int32)
 
     def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
-        """Both laws are evaluated and one is taken; the other contributes neither value nor derivative."""
+        """Both laws are evaluated and one is taken; the other, if finite, contributes neither value nor derivative."""
         return jnp.where(mode == REGULATE, self.regulator.voltage(state), self.swing_up.voltage(state))

@@ -5,7 +5,6 @@ from statistics import NormalDist
 
 from cpjax.errors import InputError
 
-
 _MOST = 2**53  # whole numbers up to here are floats without rounding
 
 

@@ -14,7 +14,9 @@ from jax import lax
 from cpjax.pytree import Scalar
 
 # Range reduction of Cody and Waite: pi/2 in three parts, the first short enough for n * part to be exact.
-# Polynomials on [-pi/4, pi/4]: float64 from fdlibm (k_sin.c, k_cos.c), float32 from Cephes (sinf.c).
+# Polynomials on [-pi/4, pi/4]: coefficients for float64 from fdlibm (k_sin.c, k_cos.c: Copyright (C) 1993 by Sun
+# Microsystems, Inc. All rights reserved. Permission to use, copy, modify, and distribute this software is freely
+# granted, provided that this notice is preserved), for float32 from Cephes (sinf.c, S. Moshier).
 _HALF_PI_64 = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 _SIN_64 = (
     -1.66666666666666324348e-01,
@@ -47,6 +49,7 @@ def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
     The derivative rule is the exact one (cos, -sin), not that of the polynomials.
     """
     angle = jnp.asarray(angle)
+    angle = angle.astype(jnp.result_type(angle, float)) if not jnp.issubdtype(angle.dtype, jnp.floating) else angle
     wide = angle.dtype == jnp.float64
     half_pi, sin_terms, cos_terms = (_HALF_PI_64, _SIN_64, _COS_64) if wide else (_HALF_PI_32, _SIN_32, _COS_32)
     turns = lax.round(angle * (2.0 / math.pi), lax.RoundingMethod.TO_NEAREST_EVEN)

@@ -23,7 +23,7 @@ class Sample(NamedTuple):
     time: jax.Array
     """[s]."""
     elapsed: jax.Array
-    """Since the sample before [s]; 0 at the first."""
+    """Since the sample before [s]; 0 at the first, and after a flag has stopped the run."""
     state: State
     voltage: jax.Array
     """Applied from now on, clipped [V]."""
@@ -59,7 +59,8 @@ class Metrics:
 
     Attributes:
       success: settled, `hold` before the end at the latest, within the track, and not stopped by a flag.
-      settling_time: first time from which |theta| (wrapped) and |x| stay in their bands to the end [s]; inf if never.
+      settling_time: first time from which |theta| (wrapped) and |x - reference_x| stay in their bands to the end [s];
+        inf if never.
       cart_travel: max |x| [m].
       effort: integral of u^2 dt [V^2 s], exact for a held voltage, by the trapezoidal rule for a continuous one.
       voltage_variation: total variation of u [V].
@@ -97,8 +98,9 @@ class ProtocolMetrics:
     """The fold that yields `Metrics`. Hard: settling time and success are piecewise constant in every parameter."""
 
     angle_band: Scalar = number("rad", "settled: |theta| within", default=0.05, above=0.0)
-    position_band: Scalar = number("m", "settled: |x| within", default=0.05, above=0.0)
+    position_band: Scalar = number("m", "settled: |x - reference_x| within", default=0.05, above=0.0)
     hold: Scalar = number("s", "success: settled at least so long before the end", default=1.0, at_least=0.0)
+    reference_x: Scalar = number("m", "where the cart is to settle", default=0.0)
     track_limit: Scalar = number("m", "success: |x| never beyond", default=math.inf, above=0.0, infinite=True)
 
     def init(self, sample: Sample) -> _Memory:
@@ -117,7 +119,8 @@ class ProtocolMetrics:
 
     def update(self, memory: _Memory, sample: Sample) -> _Memory:
         travel = jnp.abs(sample.state.x)
-        inside = (jnp.abs(wrap_angle(sample.state.theta)) <= self.angle_band) & (travel <= self.position_band)
+        away = jnp.abs(sample.state.x - self.reference_x)
+        inside = (jnp.abs(wrap_angle(sample.state.theta)) <= self.angle_band) & (away <= self.position_band)
         drift = jnp.abs(sample.voltage_before - memory.voltage)
         jump = jnp.abs(sample.voltage - sample.voltage_before)
         first, last = memory.voltage, sample.voltage_before

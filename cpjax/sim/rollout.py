@@ -16,11 +16,11 @@ from cpjax.controllers.protocol import Controller, Law, as_controller
 from cpjax.errors import InputError
 from cpjax.numeric.trigonometry import sin_cos
 from cpjax.plant import CartPole
-from cpjax.pytree import cast, check_unbatched, is_traced, pytree
+from cpjax.pytree import cast, check, is_traced, pytree
 from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, Flag
 from cpjax.sim.integrators import INTEGRATORS
 from cpjax.sim.metrics import Fold, ProtocolMetrics, Sample
-from cpjax.sim.stepper import Pair, step_continuous, step_held
+from cpjax.sim.stepper import Pair, applied_voltage, step_continuous, step_held
 from cpjax.state import ANGLE_LIMIT, RUNAWAY_LIMIT, State, checked_start
 
 Clock: TypeAlias = Literal["continuous", "sampled"]
@@ -141,7 +141,7 @@ def _simulate(
     steps, every = settings.steps, settings.save_every
     none = jnp.zeros_like(start.x, dtype=jnp.int32)
     mode = controller.start_mode(start)
-    voltage = plant.motor.saturate(controller.mode_voltage(start, mode))
+    voltage = applied_voltage(plant, controller, start, mode)
     unknown = [jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves((start, plant, controller))]
     flag = jnp.where(jnp.any(jnp.stack(unknown)), int(Flag.NON_FINITE), none)
     loop = _Loop(start, mode, voltage, flag, none)
@@ -188,10 +188,10 @@ def _observe(
     at this instant on to `_advance`, whose first stage they are."""
     state = loop.state
     mode = controller.next_mode(state, loop.mode)
-    voltage = plant.motor.saturate(controller.mode_voltage(state, mode))
+    voltage = applied_voltage(plant, controller, state, mode)
     changes = jnp.where(mode != loop.mode, loop.changes + 1, 0)
     if settings.clock == "continuous":
-        voltage_before = plant.motor.saturate(controller.mode_voltage(state, loop.mode))
+        voltage_before = applied_voltage(plant, controller, state, loop.mode)
     else:
         voltage_before = loop.voltage
         if settings.steps_per_control > 1:
@@ -205,7 +205,7 @@ def _observe(
     rates = plant.acceleration(sin, cos, (state.x_dot, state.theta_dot), force)
     sample = Sample(
         time=index.astype(dt.dtype) * dt,
-        elapsed=jnp.where(index > 0, dt, 0.0),
+        elapsed=jnp.where((index > 0) & ((flag & STOPPED) == 0), dt, 0.0),
         state=state,
         voltage=voltage,
         voltage_before=voltage_before,
@@ -223,7 +223,8 @@ def _advance(
 
     A derivative in reverse passes through both branches of a `where`, and 0 times an infinity of the branch not taken
     is NaN. So a step that is about to go wrong (told by an Euler step) is not taken from where it would: it is taken
-    from upright rest, where all is finite, and dropped.
+    from upright rest, where all is finite, and dropped. (A law that is itself not finite at a state it is asked about
+    still gives NaN derivatives; those of this library are finite.)
     """
     state, method = loop.state, INTEGRATORS[settings.integrator]
     stopped = (loop.flag & STOPPED) != 0
@@ -253,7 +254,7 @@ def _cast_arguments(
         raise InputError("metrics", fold, "a fold, such as cpjax.ProtocolMetrics()")
     controller = as_controller(controller)
     for name, part in (("plant", plant), ("controller", controller), ("metrics", fold)):
-        check_unbatched(name, part)
+        check(name, part)
     return (
         cast(plant, dtype),
         cast(controller, dtype),

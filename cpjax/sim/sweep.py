@@ -1,5 +1,6 @@
 """Many starts at once."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -36,8 +37,8 @@ def sweep(
 
     Args:
       starts: a State of arrays of shape (n,), any n.
-      chunk: starts simulated together. Every chunk has this size (the last is filled up with copies), so that one
-        compilation serves all of them.
+      chunk: starts simulated together, at most. All chunks have one size (the last is filled up with copies), so that
+        one compilation serves all of them.
       progress: called after each chunk.
 
     Returns:
@@ -50,7 +51,7 @@ def sweep(
         raise InputError("chunk", chunk, "a whole number of starts, at least 1")
     starts, _ = checked_start(starts, "starts", batched=True)
     total = jnp.shape(starts.x)[0]
-    chunk = min(chunk, total)
+    chunk = math.ceil(total / math.ceil(total / chunk))  # as even as can be, so that little is simulated twice
 
     def run(start: State) -> Any:
         return measure(

@@ -66,7 +66,7 @@ def reproduce(
     Args:
       progress: called with the rows done, their number, and the next row in words.
       path: where to save the rows after each of them (JSON). Rows of an interrupted run with the same setting and
-        version, found there, are not computed again.
+        versions, found there, are not computed again; after changing the code, choose another path.
 
     Raises:
       InputError: a setting outside its range, or a `path` that cannot be written.
@@ -122,7 +122,7 @@ def _document(setting: Setting, rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _resume(path: Path, setting: Setting) -> list[dict[str, Any]]:
-    """Rows of an interrupted run that this one would compute again to the letter."""
+    """Rows of an interrupted run with the same setting and versions."""
     if not path.exists():
         return []
     try:

@@ -267,3 +267,51 @@ def test_new_numbers_do_not_compile_again():
     other = paper.controller("corrected-centred", "lqr", paper.identified_plant(), "computed")
     cpjax.measure(paper.identified_plant(), other, cpjax.HANGING, duration=9.0, dt=0.003, clock="sampled")
     assert _simulate._cache_size() == compiled
+
+
+def test_a_run_that_settles_where_its_regulator_holds_it_is_a_success():
+    law = cpjax.StateFeedback(paper.PRINTED_GAINS["placement"], reference=State(0.3, 0.0, 0.0, 0.0))
+    settings = {"duration": 6.0, "dt": 0.002, "clock": "sampled"}
+    for where, success in ((0.3, True), (0.0, False)):
+        fold = cpjax.ProtocolMetrics(reference_x=where)
+        result = cpjax.measure(PLANT, law, State(0.0, 0.0, 0.1, 0.0), metrics=fold, **settings)
+        assert bool(result.success) == success
+
+
+def test_a_stopped_run_adds_nothing_more_to_its_effort():
+    wild = cpjax.StateFeedback([0.0, -50.0, 0.0, 0.0])
+    unlimited = dataclasses.replace(PLANT, motor=dataclasses.replace(PLANT.motor, voltage_limit=math.inf))
+    start = State(0.0, 0.1, 0.3, 0.0)
+    short, long = (cpjax.measure(unlimited, wild, start, duration=d, dt=0.002) for d in (1.0, 4.0))
+    assert int(short.flag) & Flag.RUNAWAY
+    assert float(long.effort) == float(short.effort)
+
+
+class OpaqueLaw:
+    def voltage(self, state):
+        return 0.1 * state.x
+
+
+@cpjax.pytree.pytree
+class CubicLaw:
+    """A law of a user's own, with a float64 constant that must not widen a float32 rollout."""
+
+    gain: float = cpjax.pytree.number("V/m^3", "of the cube", above=0.0)
+
+    def voltage(self, state):
+        return -self.gain * state.x**3 + np.float64(0.25) * 0
+
+
+def test_a_law_of_ones_own_runs_once_it_is_a_component():
+    with jax.numpy_dtype_promotion("standard"):  # as users have it
+        run = cpjax.rollout(PLANT, CubicLaw(2.0), jax.tree.map(jnp.float32, START), duration=0.1, dt=0.002)
+    assert run.voltage.dtype == jnp.float32
+    assert float(run.voltage[0]) == pytest.approx(-2.0 * 0.05**3)
+    with pytest.raises(cpjax.InputError, match=r"controller.* must be a number; a class of your own"):
+        cpjax.rollout(PLANT, OpaqueLaw(), START, duration=0.1, dt=0.002)
+
+
+def test_a_component_that_an_optimiser_moved_out_of_its_range_is_refused():
+    moved = jax.tree.map(lambda leaf: leaf - 2.0, PLANT)
+    with pytest.raises(cpjax.InputError, match=r"plant\.cart_mass = -1\.0: must be a finite number above 0"):
+        cpjax.rollout(moved, CENTRED, START, duration=0.1, dt=0.002)
