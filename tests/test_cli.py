@@ -368,7 +368,7 @@ BAD_FLAGS = [
     (["--gain", "1", "2", "3", "4", "--design", "lqr"], ["gain = [1.0, 2.0, 3.0, 4.0]", "absent"]),
     (["--energy-gain", "-1"], ["energy_gain = -1.0", "at least 0"]),
     (["--kick", "inf"], ["kick = inf", "a finite number"]),
-    (["--kick-radius", "0"], ["kick_radius = 0.0", "above 0"]),
+    (["--kick-radius", "0"], ["kick_radius = 0.0", "at least 0.001"]),
     (["--law", "as-printed", "--kick", "1"], ["kick = 1.0", "the law as-printed has no such term"]),
     (["--gate", "box"], ["--gate", "'box'", "lyapunov"]),
     (["--half-angle", "4"], ["half_angle = 4.0", "at most 3.14159 [rad]"]),

@@ -23,7 +23,7 @@ figcaption, .note { color: var(--soft); font-size: 0.93rem; margin-top: 0.4rem; 
 .scroll { overflow-x: auto; border: 1px solid var(--line); border-radius: 6px; }
 table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
 th, td { padding: 0.35rem 0.6rem; text-align: right; white-space: nowrap; }
-th { background: var(--band); font-weight: 600; vertical-align: bottom; }
+th { background: var(--band); font-weight: 600; vertical-align: bottom; white-space: normal; }
 th.text, td.text { text-align: left; } tbody tr + tr td { border-top: 1px solid var(--line); }
 code { font-size: 0.92em; background: var(--band); padding: 0.05em 0.3em; border-radius: 4px; }
 @media print { body { max-width: none; } figure, tr { break-inside: avoid; } .scroll { overflow: visible; border: 0; }

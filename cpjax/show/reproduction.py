@@ -78,7 +78,7 @@ def findings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     def rate(law: str, design: str) -> str:
         keys = {"law": law, "plant": "appendix", "design": design, "gains": "printed"}
         row = next(r for r in rows if all(r[k] == v for k, v in keys.items()))
-        return f"{100 * row['success_rate']:.1f} %"
+        return f"{100 * row['success_rate']:.2f} %"
 
     pairs = {(r["law"], r["plant"]) for r in rows}
     ahead = {"placement": 0, "lqr": 0}
@@ -95,7 +95,7 @@ def findings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return [
         f"On the appendix's plant, the law and the gains as printed catch {caught('as-printed')}.",
         f"The energy law corrected, with the paper's k = 0.2, catches {caught('corrected')}; the same law read "
-        f"as a voltage, {100 * as_voltage:.1f} % at most.",
+        f"as a voltage, {100 * as_voltage:.2f} % at most.",
         f"With a larger energy gain and the cart held near the middle (no longer the paper's law), the printed gains "
         f"catch {caught('corrected-centred')}.",
         f"The paper sees slightly better performance with LQR. In these {len(pairs)} comparisons on both plants, with "
