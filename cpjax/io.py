@@ -72,7 +72,7 @@ def save(path: str | Path, thing: Any) -> None:
     Raises:
       InputError: another extension, a component that is not in `TYPES`, or values that JAX is tracing.
     """
-    path = Path(path)
+    path = _checked_path(path)
     suffix = _suffix(path)
     table = {"schema": SCHEMA, **encode(thing)}
     write_text(path, tomli_w.dumps(table) if suffix == ".toml" else dump_json(table))
@@ -85,7 +85,7 @@ def load(path: str | Path) -> Any:
       InputError: no such file, not JSON or TOML, another schema, an unknown type or key, a missing key, or a value
         outside its range.
     """
-    path = Path(path)
+    path = _checked_path(path)
     table = read_table(path)
     schema = table.pop("schema", SCHEMA)
     if isinstance(schema, bool) or schema != SCHEMA:
@@ -169,6 +169,12 @@ def write_bytes(path: Path, content: bytes) -> None:
 def versions() -> dict[str, str]:
     """Versions of what a result depends on."""
     return {name: importlib.metadata.version(name) for name in ("cpjax", "jax", "jaxlib", "numpy", "scipy")}
+
+
+def _checked_path(path: Any) -> Path:
+    if not isinstance(path, (str, Path)):
+        raise InputError("path", path, "a file name, as str or Path; it comes first")
+    return Path(path)
 
 
 def _suffix(path: Path) -> str:

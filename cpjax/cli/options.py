@@ -74,7 +74,12 @@ CONTROLLER_OPTIONS = [
     ),
     Option("controller", "K", "the regulator's gain itself, instead of design and gains", float, count=4, flag="gain"),
     *_numbers_of("controller", EnergySwingUp),
-    Option("controller", "gate", "where the regulator takes over (default angle)", choices=tuple(_GATES)),
+    Option(
+        "controller",
+        "gate",
+        "where the regulator takes over (default angle); lyapunov is a level set of the paper's LQR and needs --level",
+        choices=tuple(_GATES),
+    ),
     *_numbers_of("controller", AngleRateGate),
     *_numbers_of("controller", LyapunovGate, ["level"]),
     Option("controller", "reference_x", "where the cart is to be held (default 0) [m]", float),
@@ -116,7 +121,7 @@ def add_options(parser: argparse.ArgumentParser, options: Sequence[Option], *, o
                 choices=option.choices,
                 nargs=option.count,
                 metavar=None if option.choices else option.key.upper(),
-                help=option.help,
+                help=option.help + (f" (key: {option.key})" if option.flag else ""),
             )
 
 
