@@ -9,7 +9,6 @@ options, the files' keys and the documentation, so that a parameter is described
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
 import jax
@@ -151,26 +150,18 @@ def pytree(cls: type[T]) -> type[T]:
     Raises (from the constructor):
       InputError: a concrete value outside its declared range, not a number, or of the wrong shape or dtype.
     """
-    checked = hasattr(cls, "__post_init__")
+    own_check = getattr(cls, "__post_init__", None)
 
-    def check_fields(self: Any) -> None:
+    def post_init(self: Any) -> None:
         for name, rule in rules(cls).items():
             object.__setattr__(self, name, rule.normalise(f"{cls.__name__}.{name}", getattr(self, name)))
+        if own_check is not None:
+            own_check(self)
 
-    if checked:
-        own: Callable[[Any], None] = cls.__post_init__  # type: ignore[attr-defined]  # hasattr was just tested
-
-        def post_init(self: Any) -> None:
-            check_fields(self)
-            own(self)
-
-        cls.__post_init__ = post_init  # type: ignore[attr-defined]  # as above
-    else:
-        cls.__post_init__ = check_fields  # type: ignore[attr-defined]  # added for dataclass() below
-
+    cls.__post_init__ = post_init  # type: ignore[attr-defined]  # mypy knows no attribute added to a class
     # Equality stays identity: comparing fields that hold arrays has no single truth value.
-    cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
-    names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]  # a dataclass since the line above
+    made: Any = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    names = [field.name for field in dataclasses.fields(made)]
 
     def flatten_with_keys(tree: Any) -> tuple[list[tuple[Any, Any]], None]:
         return [(jax.tree_util.GetAttrKey(name), getattr(tree, name)) for name in names], None
@@ -180,13 +171,13 @@ def pytree(cls: type[T]) -> type[T]:
 
     def unflatten(_: None, leaves: Any) -> T:
         # Bypasses __init__ and with it the checks: JAX's leaves may be anything.
-        tree = object.__new__(cls)
+        tree = object.__new__(made)
         for name, value in zip(names, leaves, strict=True):
             object.__setattr__(tree, name, value)
         return tree
 
-    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
-    return cls
+    jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
+    return made
 
 
 def is_traced(value: Any) -> bool:

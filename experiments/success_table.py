@@ -14,12 +14,13 @@ from _common import run
 
 from cpjax import io
 from cpjax.numeric.statistics import two_proportion_p_value
+from cpjax.paper import Design
 from cpjax.show.figures import save_figure, success_rates
 from cpjax.study.reproduction import Setting, Variant, evaluate
 from cpjax.study.summary import summarise
 
 REFERENCE_COUNT = 512
-REFERENCE = {
+REFERENCE: dict[tuple[str, str, Design], float] = {
     ("as-printed", "appendix", "placement"): 0.176,
     ("as-printed", "appendix", "lqr"): 0.100,
     ("as-printed", "identified", "placement"): 0.230,
@@ -41,7 +42,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     setting = Setting(count=64 if quick else 4096, seed=seed)
     rows = []
     for (law, plant, design), reference in REFERENCE.items():
-        row = summarise(evaluate(Variant(law, plant, design, "printed"), setting))  # type: ignore[arg-type]  # a Design
+        row = summarise(evaluate(Variant(law, plant, design, "printed"), setting))
         p = two_proportion_p_value(row["successes"], row["count"], round(reference * REFERENCE_COUNT), REFERENCE_COUNT)
         names = {"law": law, "plant": plant, "design": design, "gains": "printed"}
         rows.append({**names, **row, "reference_rate": reference, "p_value": p, "confirmed": p >= 1e-3})

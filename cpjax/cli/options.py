@@ -205,13 +205,12 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
                 raise
             raise InputError("controller", file, "a file that holds a controller or a law") from problem
     name = changes.pop("law", "corrected-centred")
-    law = paper.LAWS[name](plant)
+    law: Any = paper.LAWS[name](plant)  # a dataclass, which the protocol that annotates it does not say
     law_changes = {key: changes.pop(key) for key in list(changes) if key in rules(EnergySwingUp)}
     for key in law_changes:
         if key not in rules(type(law)):
             raise InputError(key, law_changes[key], f"absent: the law {name} has no such term")
-    # Every law is a dataclass; the protocol that annotates them does not say so.
-    swing_up: Any = dataclasses.replace(law, **law_changes)  # type: ignore[type-var]
+    swing_up = dataclasses.replace(law, **law_changes)
     reference = State(changes.pop("reference_x", 0.0), 0.0, 0.0, 0.0)
     regulator = _build_regulator(changes, plant, reference)
     gate = _build_gate(changes, plant, reference)

@@ -98,8 +98,9 @@ def _title(metrics: Metrics) -> str:
 
 def _print(metrics: Metrics) -> None:
     table = Table(title=_title(metrics), title_justify="left")
-    for heading, justify in (("metric", "left"), ("value", "right"), ("unit", "left")):
-        table.add_column(heading, justify=justify)  # type: ignore[arg-type]  # rich wants the literal
+    table.add_column("metric")
+    table.add_column("value", justify="right")
+    table.add_column("unit")
     for name, field, unit in _ROWS:
         value = np.asarray(getattr(metrics, field))
         text = str(int(value)) if np.issubdtype(value.dtype, np.integer) else f"{float(value):.4g}"

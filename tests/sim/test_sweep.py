@@ -1,8 +1,8 @@
 """Many starts at once: what one chunk may cost, and that chunks are only a way of working."""
 
+import importlib
 import json
-import subprocess
-import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -13,36 +13,15 @@ from cpjax import paper
 PLANT = paper.appendix_plant()
 CENTRED = paper.controller("corrected-centred", "placement", PLANT)
 
-LARGE = """
-import json, resource, jax
-jax.config.update("jax_enable_x64", True)
-import cpjax
-from cpjax import paper
-
-def peak_mebibytes():
-    # Of this process; ru_maxrss would also count what its parent held when it was started.
-    try:
-        status = open("/proc/self/status").read()
-        return int(status.split("VmHWM:")[1].split()[0]) / 1024
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 
-plant = paper.appendix_plant()
-controller = paper.controller("corrected-centred", "placement", plant)
-starts = cpjax.sample_starts("hanging", 4096, seed=3)
-settings = dict(duration=10.0, dt=0.002, clock="sampled")
-metrics = jax.jit(jax.vmap(lambda start: cpjax.measure(plant, controller, start, **settings)))(starts)
-success = float(metrics.success.mean())
-print(json.dumps([success, peak_mebibytes()]))
-"""
-
-
-def test_4096_starts_of_10_s_run_under_one_vmap_within_a_gibibyte():
-    done = subprocess.run([sys.executable, "-c", LARGE], capture_output=True, text=True, check=True)
-    success, peak_mebibytes = json.loads(done.stdout)
-    assert success > 0.98
-    assert peak_mebibytes < 1024
+def test_4096_starts_of_10_s_run_under_one_vmap_within_a_gibibyte(monkeypatch):
+    monkeypatch.syspath_prepend(str(EXPERIMENTS))
+    start_up = importlib.import_module("start_up")  # its script runs in a process of its own
+    figures = json.loads(start_up.python(start_up.SWEEP.format(count=4096, seed=3, duration=10.0)))
+    assert figures["success"] > 0.98
+    assert figures["peak_MiB"] < 1024
 
 
 def test_the_result_does_not_depend_on_the_chunk():
