@@ -1,0 +1,365 @@
+"""The algebraic Riccati equations of the linear quadratic regulator, in continuous and discrete time.
+
+    A' P + P A - K' R K + Q = 0                    K = R^-1 (B' P + N')
+    A' P A - P - K' (R + B' P B) K + Q = 0         K = (R + B' P B)^-1 (B' P A + N')
+
+and of their solutions the one under which u = -K s stabilises and minimises the integral, or the sum, of
+s' Q s + 2 s' N u + u' R u.
+
+Method: a structure-preserving doubling algorithm (Anderson, 1978; Chu, Fan and Lin, 2005) finds P to most of its
+digits. Newton's method (Kleinman, 1964; Hewer, 1971) corrects it, with the residual, P and K in double-word arithmetic,
+so that what is returned is the rounding of the exact solution, until the condition of the problem is beyond all floats.
+Each correction is a Lyapunov or Stein equation, and solving it proves the closed loop stable.
+
+Derivatives come from the same equations (Kao and Hennequin, 2020): with dA, dB, dQ, dN, dR and D = dA - dB K,
+
+    A_K' dP + dP A_K + (D' P + P D + dQ - dN K - K' dN' + K' dR K) = 0,      A_K = A - B K
+
+and its counterpart, solved by a function that is itself differentiable: every order exists.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from cpjax.design.arguments import matrices, shaped, square
+from cpjax.design.lyapunov import Sum, cayley_shift, lyapunov_equation, stein_equation, sum_continuous, sum_discrete
+from cpjax.errors import InputError
+from cpjax.numeric import double_word as dw
+from cpjax.numeric.double_word import DoubleWord, double_word
+from cpjax.numeric.small_matrices import (
+    Matrix,
+    accurate_product,
+    accurate_solve,
+    batch_last,
+    diagonal,
+    identity_like,
+    inverse,
+    is_positive_definite,
+    largest,
+    linear_solve,
+    product,
+    symmetric,
+    transpose,
+)
+from cpjax.pytree import Array, is_traced
+
+_MOST_DOUBLINGS = 60
+_MOST_CORRECTIONS = 12
+
+Problem: TypeAlias = tuple[Any, Any, Any, Any, Any]
+"""A (n, n), B (n, m), Q (n, n), R (m, m), N (n, m)."""
+
+
+class RiccatiSolution(NamedTuple):
+    """P (n, n), K (m, n), and whether they were found; if not, both are NaN."""
+
+    P: jax.Array
+    K: jax.Array
+    found: jax.Array
+
+
+def care(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -> jax.Array:
+    """P (n, n) of the continuous-time algebraic Riccati equation; see `solve_care`."""
+    return solve_care(A, B, Q, R, N).P
+
+
+def dare(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -> jax.Array:
+    """P (n, n) of the discrete-time algebraic Riccati equation; see `solve_dare`."""
+    return solve_dare(A, B, Q, R, N).P
+
+
+def solve_care(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -> RiccatiSolution:
+    """The stabilising solution of the continuous-time Riccati equation, with its gain.
+
+    Differentiable to any order in all arguments. Only the symmetric parts of Q and R count.
+
+    Args:
+      A: (n, n).
+      B: (n, m).
+      Q: (n, n), symmetric, positive semidefinite.
+      R: (m, m), symmetric, positive definite.
+      N: (n, m), such that [[Q, N], [N', R]] is positive semidefinite; zero if left out.
+
+    Raises:
+      InputError: shapes that do not fit, a concrete Q, R or N that is not as above, a concrete pair (A, B) that is not
+        stabilisable or (A, Q) that is not detectable, or a problem too ill-conditioned for its dtype. Under jit the
+        solution is NaN then, and its `found` is False.
+    """
+    return _solved(_continuous, "continuous", A, B, Q, R, N)
+
+
+def solve_dare(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -> RiccatiSolution:
+    """The stabilising solution of the discrete-time Riccati equation, with its gain; as `solve_care`."""
+    return _solved(_discrete, "discrete", A, B, Q, R, N)
+
+
+def _solved(equation: Callable[..., Any], time: str, A: Array, B: Array, Q: Array, R: Array, N: Any) -> RiccatiSolution:
+    given = {"A": A, "B": B, "Q": Q, "R": R} | ({} if N is None else {"N": N})
+    A, B, Q, R, *cross = matrices(**given)
+    n = square("A", A)
+    if B.ndim != 2 or B.shape[0] != n or B.shape[1] == 0:
+        raise InputError("B", f"array of shape {B.shape}", f"of shape ({n}, m); batches go through jax.vmap")
+    m = B.shape[1]
+    shaped("Q", Q, (n, n))
+    shaped("R", R, (m, m))
+    N = cross[0] if cross else jnp.zeros((n, m), dtype=A.dtype)
+    shaped("N", N, (n, m))
+    problem = (A, B, Q, R, N)
+    concrete = not any(is_traced(x) for x in problem)
+    if concrete:
+        _check_weights(*(np.asarray(x, dtype=np.float64) for x in (Q, R, N)))
+    P, K = equation(A, B, 0.5 * (Q + Q.T), 0.5 * (R + R.T), N)
+    found = jnp.all(jnp.isfinite(P))
+    if concrete and not found:
+        raise _reason(time, *(np.asarray(x, dtype=np.float64) for x in problem))
+    return RiccatiSolution(P, K, found)
+
+
+# --- the solutions, matrix axes first ---------------------------------------------------------------------------------
+
+
+@batch_last
+def _solve_continuous(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix]:
+    a, b, q, r, cross = (double_word(x) for x in (A, B, Q, R, transpose(N)))
+
+    def gain(P: DoubleWord) -> tuple[DoubleWord, DoubleWord]:
+        right = dw.add(accurate_product(transpose(b), P), cross)
+        return accurate_solve(r, right), right
+
+    def correction(P: DoubleWord) -> Sum:
+        K, right = gain(P)
+        PA = accurate_product(P, a)
+        rest = dw.add(q, dw.negative(accurate_product(transpose(right), K)))
+        rest = dw.add(dw.add(PA, transpose(PA)), rest)
+        return sum_continuous(A - product(B, K.high), symmetric(rest.high))
+
+    start = _double(*_cayley(A, B, Q, R, N))
+    return _corrected(start, correction, gain, _weights_are_valid(Q, R, N))
+
+
+@batch_last
+def _solve_discrete(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix]:
+    a, b, q, r, cross = (double_word(x) for x in (A, B, Q, R, transpose(N)))
+
+    def gain(P: DoubleWord) -> tuple[DoubleWord, DoubleWord]:
+        BP = accurate_product(transpose(b), P)
+        right = dw.add(accurate_product(BP, a), cross)
+        return accurate_solve(dw.add(r, accurate_product(BP, b)), right), right
+
+    def correction(P: DoubleWord) -> Sum:
+        K, right = gain(P)
+        rest = dw.add(accurate_product(transpose(a), accurate_product(P, a)), dw.negative(P))
+        rest = dw.add(rest, dw.add(q, dw.negative(accurate_product(transpose(right), K))))
+        return sum_discrete(A - product(B, K.high), symmetric(rest.high))
+
+    A0, G, H = _without_cross_term(A, B, Q, R, N)
+    scale = _balance(G, H)
+    start = _double(A0, G * scale, H / scale, scale)
+    return _corrected(start, correction, gain, _weights_are_valid(Q, R, N))
+
+
+class _Start(NamedTuple):
+    P: Matrix
+    plausible: jax.Array
+
+
+def _without_cross_term(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix, Matrix]:
+    """A, G = B R^-1 B' and H = Q of the same equation with N = 0."""
+    weight = inverse(R)
+    H = symmetric(Q - product(N, weight, transpose(N)))
+    return A - product(B, weight, transpose(N)), symmetric(product(B, weight, transpose(B))), H
+
+
+def _balance(G: Matrix, H: Matrix) -> jax.Array:
+    """The factor that makes G and H equally large; P is scaled by its reciprocal."""
+    scale = jnp.sqrt(largest(H) / largest(G))
+    return jnp.where((scale > 0.0) & jnp.isfinite(scale), scale, 1.0)
+
+
+def _cayley(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix, Matrix, jax.Array]:
+    """The discrete-time problem E, G, H with the same solution, up to the returned scale (Chu, Fan and Lin, 2005)."""
+    A, G, H = _without_cross_term(A, B, Q, R, N)
+    scale = _balance(G, H)
+    G, H = G * scale, H / scale
+    upper = jnp.concatenate([A, -G], axis=1)
+    lower = jnp.concatenate([-H, -transpose(A)], axis=1)
+    # Near the geometric mean of the closed loop's eigenvalues; the factor keeps it from being one of A's by design.
+    shift = 1.0987 * cayley_shift(jnp.concatenate([upper, lower], axis=0))
+    identity = identity_like(A)
+    resolvent = inverse(shift * identity - A)
+    coupled = inverse(shift * identity - transpose(A) + product(H, resolvent, G))
+    E = 2.0 * shift * transpose(coupled) - identity
+    G = 2.0 * shift * product(resolvent, G, coupled)
+    H = 2.0 * shift * product(coupled, H, resolvent)
+    return E, symmetric(G), symmetric(H), scale
+
+
+def _double(E: Matrix, G: Matrix, H: Matrix, scale: jax.Array) -> _Start:
+    """Anderson's doubling: H grows to the solution and G to that of the dual equation, while E vanishes."""
+    eps = np.finfo(E.dtype).eps
+    Carry: TypeAlias = tuple[Matrix, Matrix, Matrix, jax.Array, jax.Array]
+
+    def unfinished(carry: Carry) -> jax.Array:
+        *_, finished, count = carry
+        return ~jnp.all(finished) & (count < _MOST_DOUBLINGS)
+
+    def double(carry: Carry) -> Carry:
+        E, G, H, _, count = carry
+        V = inverse(identity_like(E) + product(G, H))
+        EV = product(E, V)
+        more_G = product(EV, G, transpose(E))
+        more_H = product(transpose(E), H, V, E)
+        G, H = symmetric(G + more_G), symmetric(H + more_H)
+        # Convergence is quadratic: what comes after a change of sqrt(eps) is below eps.
+        change = jnp.maximum(_relative_size(more_G, G), _relative_size(more_H, H))
+        return product(EV, E), G, H, ~(change > eps**0.5), count + 1
+
+    finished = jnp.zeros(E.shape[2:], dtype=bool)
+    E, G, H, _, _ = lax.while_loop(unfinished, double, (E, G, H, finished, jnp.zeros((), dtype=jnp.int32)))
+    # Where an unstable mode cannot be moved or is not seen, H or G grows to where rounding stops it. The trace of
+    # G H is the same in all coordinates of the state.
+    plausible = jnp.sum(G * H, axis=(0, 1)) < 0.01 / eps
+    return _Start(H * scale, plausible)
+
+
+def _relative_size(change: Matrix, P: Matrix) -> jax.Array:
+    """The largest element of `change`, each relative to the geometric mean of P's diagonal elements on its lines."""
+    root = jnp.sqrt(jnp.abs(diagonal(P)))
+    finfo = np.finfo(P.dtype)
+    return jnp.max(jnp.abs(change) / (root[:, None] * root[None] + finfo.eps * largest(P) + finfo.tiny), axis=(0, 1))
+
+
+def _corrected(
+    start: _Start,
+    correction: Callable[[DoubleWord], Sum],
+    gain: Callable[[DoubleWord], tuple[DoubleWord, DoubleWord]],
+    valid: jax.Array,
+) -> tuple[Matrix, Matrix]:
+    """Newton's method until P no longer changes; NaN where that, or anything before it, failed."""
+    dtype, batch = start.P.dtype, start.P.shape[2:]
+    eps = np.finfo(dtype).eps
+    Carry: TypeAlias = tuple[DoubleWord, jax.Array, jax.Array, jax.Array, jax.Array]
+
+    def unfinished(carry: Carry) -> jax.Array:
+        _, size, previous, _, count = carry
+        # What the next correction would be is a small multiple of this one, or of its square.
+        return jnp.any((size > eps**0.75) & (size < 0.5 * previous)) & (count < _MOST_CORRECTIONS)
+
+    def correct(carry: Carry) -> Carry:
+        P, previous, _, _, count = carry
+        X, stable = correction(P)
+        P = dw.add(P, double_word(symmetric(X)))
+        return P, _relative_size(X, P.high), previous, stable, count + 1
+
+    unknown = jnp.full(batch, np.finfo(dtype).max, dtype=dtype)
+    stable, count = jnp.zeros(batch, dtype=bool), jnp.zeros((), dtype=jnp.int32)
+    carry = (double_word(start.P), unknown, jnp.full_like(unknown, jnp.inf), stable, count)
+    P, size, _, stable, _ = lax.while_loop(unfinished, correct, carry)
+    found = valid & start.plausible & stable & (size <= eps**0.75)
+    return jnp.where(found, P.high, jnp.nan), jnp.where(found, gain(P)[0].high, jnp.nan)
+
+
+def _weights_are_valid(Q: Matrix, R: Matrix, N: Matrix) -> jax.Array:
+    """Whether R is positive definite and [[Q, N], [N', R]] positive semidefinite, to rounding."""
+    H = symmetric(Q - product(N, inverse(R), transpose(N)))
+    size = jnp.sqrt(jnp.abs(diagonal(Q)))
+    size = jnp.where(size > 0.0, size, 1.0)
+    room = 16.0 * H.shape[0] * np.finfo(H.dtype).eps * identity_like(H)
+    return is_positive_definite(R) & is_positive_definite(H / (size[:, None] * size[None]) + room)
+
+
+# --- derivatives, of plain matrices -----------------------------------------------------------------------------------
+
+
+@jax.custom_jvp
+def _continuous(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, N: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return _solve_continuous(A, B, Q, R, N)
+
+
+@jax.custom_jvp
+def _discrete(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, N: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return _solve_discrete(A, B, Q, R, N)
+
+
+def _forcing(P: jax.Array, K: jax.Array, push: jax.Array, tangents: Problem) -> jax.Array:
+    """What the changes of the problem add to the equation: `push` is P (dA - dB K), times A_K in discrete time."""
+    _, _, dQ, dR, dN = tangents
+    cross = dN @ K
+    return push + push.T + dQ - cross - cross.T + K.T @ dR @ K
+
+
+@_continuous.defjvp
+def _continuous_jvp(primals: Problem, tangents: Problem) -> tuple[Any, Any]:
+    A, B, _, R, _ = primals
+    dA, dB, _, dR, dN = tangents
+    P, K = _continuous(*primals)
+    change = dA - dB @ K
+    dP = lyapunov_equation(A - B @ K, _forcing(P, K, P @ change, tangents))
+    dK = linear_solve(R, dB.T @ P + B.T @ dP + dN.T - dR @ K)
+    return (P, K), (dP, dK)
+
+
+@_discrete.defjvp
+def _discrete_jvp(primals: Problem, tangents: Problem) -> tuple[Any, Any]:
+    A, B, _, R, _ = primals
+    dA, dB, _, dR, dN = tangents
+    P, K = _discrete(*primals)
+    closed = A - B @ K
+    change = dA - dB @ K
+    dP = stein_equation(closed, _forcing(P, K, closed.T @ P @ change, tangents))
+    BP = B.T @ P
+    dK = linear_solve(R + BP @ B, (dB.T @ P + B.T @ dP) @ closed + BP @ change + dN.T - dR @ K)
+    return (P, K), (dP, dK)
+
+
+# --- why there is no solution, for people -----------------------------------------------------------------------------
+
+_Numbers: TypeAlias = np.ndarray[Any, Any]
+
+
+def _check_weights(Q: _Numbers, R: _Numbers, N: _Numbers) -> None:
+    for name, weight in (("Q", Q), ("R", R)):
+        if np.max(np.abs(weight - weight.T)) > 1e-6 * np.max(np.abs(weight)):
+            raise InputError(name, weight, "a symmetric matrix")
+    if not np.min(np.linalg.eigvalsh(R)) > 0.0:
+        raise InputError("R", R, "positive definite: every input must cost something")
+    joint = np.block([[Q, N], [N.T, R]]) if np.any(N) else Q
+    size = np.sqrt(np.abs(np.diag(joint)))
+    size[size == 0.0] = 1.0
+    if not np.min(np.linalg.eigvalsh(joint / np.outer(size, size))) > -1e-6:
+        if np.any(N):
+            raise InputError("N", N, "such that [[Q, N], [N', R]] is positive semidefinite")
+        raise InputError("Q", Q, "positive semidefinite")
+
+
+def _reason(time: str, A: _Numbers, B: _Numbers, Q: _Numbers, R: _Numbers, N: _Numbers) -> InputError:
+    weight = np.linalg.inv(R)
+    free = A - B @ weight @ N.T
+    cost = Q - N @ weight @ N.T
+    for name, matrix, other, words in (
+        ("B", A, B, "stabilisable with A: it must move the mode with eigenvalue"),
+        ("Q", free.T, cost, "detectable with A: it must weigh the mode with eigenvalue"),
+    ):
+        mode = _fixed_mode(time, matrix, other)
+        if mode is not None:
+            return InputError(name, B if name == "B" else Q, f"{words} {mode:.6g}, which is not stable by itself")
+    return InputError("Q", Q, "better conditioned with A, B and R: no solution can be told from rounding in this dtype")
+
+
+def _fixed_mode(time: str, A: _Numbers, B: _Numbers) -> complex | None:
+    """An eigenvalue of A on or beyond the edge of stability that no input moves (Popov, Belevitch, Hautus)."""
+    for mode in np.linalg.eigvals(A):
+        room = 1e-7 * max(1.0, float(np.linalg.norm(A)))
+        if (mode.real if time == "continuous" else abs(mode) - 1.0) < -room:
+            continue
+        pencil = np.hstack(
+            [(mode * np.eye(len(A)) - A) / max(np.linalg.norm(A), 1e-300), B / max(np.linalg.norm(B), 1e-300)]
+        )
+        if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-7:
+            return complex(mode) if mode.imag else float(mode.real)
+    return None

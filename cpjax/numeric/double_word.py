@@ -1,0 +1,83 @@
+"""Arithmetic with twice the working precision: a number as the unevaluated sum of two floats (Dekker, 1971).
+
+For residuals: what is left when two large, nearly equal things are subtracted has digits in this arithmetic when plain
+floats have none. The error bounds are those of Joldes, Muller and Popescu (2017): a few units of eps^2, relative to
+the terms that were added, not to a sum in which they cancel.
+
+Compilers may contract a product and a sum into one fused operation, which breaks the usual error-free product. Here
+operands are cut so that the products are exact, and contraction changes nothing.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+
+class DoubleWord(NamedTuple):
+    """The number high + low, |low| at most half a unit in the last place of high. Two arrays of one shape."""
+
+    high: jax.Array
+    low: jax.Array
+
+
+def double_word(x: jax.Array) -> DoubleWord:
+    """A plain float."""
+    return DoubleWord(x, jnp.zeros_like(x))
+
+
+def two_sum(a: jax.Array, b: jax.Array) -> DoubleWord:
+    """a + b, exactly (Knuth)."""
+    total = a + b
+    part = total - a
+    return DoubleWord(total, (a - (total - part)) + (b - part))
+
+
+def _fast_two_sum(a: jax.Array, b: jax.Array) -> DoubleWord:
+    """a + b, exactly, where |a| is at least |b|."""
+    total = a + b
+    return DoubleWord(total, b - (total - a))
+
+
+def _split(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """x as a sum of two floats with half the digits each, so that products of such halves are exact."""
+    kind, mask = (jnp.uint64, 0xFFFFFFFFF8000000) if x.dtype == jnp.float64 else (jnp.uint32, 0xFFFFF000)
+    bits = lax.bitcast_convert_type(x, kind) & jnp.asarray(mask, dtype=kind)
+    high = lax.bitcast_convert_type(bits, x.dtype)
+    return high, x - high
+
+
+def two_product(a: jax.Array, b: jax.Array) -> DoubleWord:
+    """a b to twice the working precision."""
+    a_high, a_low = _split(a)
+    b_high, b_low = _split(b)
+    cross = two_sum(a_high * b_low, a_low * b_high)
+    total = two_sum(a_high * b_high, cross.high)
+    return DoubleWord(total.high, total.low + (cross.low + a_low * b_low))
+
+
+def add(x: DoubleWord, y: DoubleWord) -> DoubleWord:
+    """x + y."""
+    total = two_sum(x.high, y.high)
+    return _fast_two_sum(total.high, total.low + (x.low + y.low))
+
+
+def negative(x: DoubleWord) -> DoubleWord:
+    """-x."""
+    return DoubleWord(-x.high, -x.low)
+
+
+def multiply(x: DoubleWord, y: DoubleWord) -> DoubleWord:
+    """x y."""
+    total = two_product(x.high, y.high)
+    return _fast_two_sum(total.high, total.low + (x.high * y.low + x.low * y.high))
+
+
+def divide(x: DoubleWord, y: DoubleWord) -> DoubleWord:
+    """x / y, by two steps of long division."""
+    first = x.high / y.high
+    rest = add(x, negative(multiply(double_word(first), y)))
+    second = rest.high / y.high
+    rest = add(rest, negative(multiply(double_word(second), y)))
+    return add(_fast_two_sum(first, second), double_word(rest.high / y.high))
