@@ -17,6 +17,10 @@ from cpjax.controllers import (
     LyapunovGate,
     StateFeedback,
 )
+from cpjax.design.discretization import discretize
+from cpjax.design.lqr import dlqr, lqr
+from cpjax.design.placement import QuadraticFactors, place, place_polynomial
+from cpjax.design.riccati import care, dare
 from cpjax.errors import InputError
 from cpjax.io import load, save
 from cpjax.plant import CartPole, LinearModel, Motor, linearize
@@ -49,14 +53,22 @@ __all__ = [
     "Metrics",
     "Motor",
     "ProtocolMetrics",
+    "QuadraticFactors",
     "State",
     "StateFeedback",
     "Trajectory",
     "__version__",
+    "care",
+    "dare",
+    "discretize",
+    "dlqr",
     "linearize",
     "load",
+    "lqr",
     "measure",
     "paper",
+    "place",
+    "place_polynomial",
     "rollout",
     "sample_starts",
     "save",

@@ -6,8 +6,9 @@ Its sections are cited below; docs/paper.md lists its errors in print with the t
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, get_args
 
+import jax
 import numpy as np
 
 from cpjax.controllers.energy import EnergySwingUp
@@ -15,6 +16,8 @@ from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.gates import AngleGate
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import Law
+from cpjax.design.lqr import lqr
+from cpjax.design.placement import place
 from cpjax.errors import InputError
 from cpjax.numeric.trigonometry import sin_cos
 from cpjax.plant import CartPole, Motor, linearize
@@ -136,42 +139,31 @@ LAWS: Mapping[str, Callable[[CartPole], Law]] = {
 longer the paper's: the corrected law with a larger gain and with cart-centring terms."""
 
 
-def computed_gain(design: Design, plant: CartPole) -> np.ndarray:
-    """The gain (1, 4) that the paper's poles or weights really give on `plant`.
+def computed_gain(design: Design, plant: CartPole) -> jax.Array:
+    """The gain (1, 4) that the paper's poles or weights really give on `plant`; differentiable in its parameters.
 
     Raises:
       InputError: `design` is not one of the two, or the plant has no such gain.
     """
     _check_choice("design", design, get_args(Design))
-    A, B = _linear_model(plant)
-    if design == "lqr":
-        return B.T @ riccati_solution(plant) / R
-    from scipy.signal import place_poles
-
-    try:
-        return np.asarray(place_poles(A, B, POLES).gain_matrix)
-    except (ValueError, np.linalg.LinAlgError) as problem:
-        raise InputError("plant", plant, f"one for which a placement gain can be computed ({problem})") from problem
-
-
-def riccati_solution(plant: CartPole) -> np.ndarray:
-    """P (4, 4) of the paper's linear quadratic regulator on `plant` (section IV-B, "State Dependent" there)."""
-    from scipy.linalg import solve_continuous_are
-
-    A, B = _linear_model(plant)
-    try:
-        P = solve_continuous_are(A, B, np.diag(Q), np.array([[R]]))
-    except (ValueError, np.linalg.LinAlgError) as problem:
-        raise InputError(
-            "plant", plant, f"one for which an LQR gain, or P of a lyapunov gate, can be computed ({problem})"
-        ) from problem
-    return np.asarray(P + P.T) / 2
-
-
-def _linear_model(plant: CartPole) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """A and B as NumPy arrays, which SciPy takes."""
     A, B = linearize(plant)
-    return np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
+    try:
+        return place(A, B, POLES) if design == "placement" else lqr(A, B, np.diag(Q), [[R]]).K
+    except InputError as problem:
+        raise InputError("plant", plant, f"one for which a {design} gain can be computed ({problem})") from problem
+
+
+def riccati_solution(plant: CartPole) -> jax.Array:
+    """P (4, 4) of the paper's linear quadratic regulator on `plant` (section IV-B, "State Dependent" there).
+
+    Raises:
+      InputError: the plant has no such regulator.
+    """
+    A, B = linearize(plant)
+    try:
+        return lqr(A, B, np.diag(Q), [[R]]).P
+    except InputError as problem:
+        raise InputError("plant", plant, f"one for which an lqr gain can be computed ({problem})") from problem
 
 
 def regulator(design: Design, gains: Gains, plant: CartPole) -> StateFeedback:
@@ -182,8 +174,7 @@ def regulator(design: Design, gains: Gains, plant: CartPole) -> StateFeedback:
     """
     _check_choice("design", design, get_args(Design))
     _check_choice("gains", gains, get_args(Gains))
-    K = computed_gain(design, plant) if gains == "computed" else np.array([PRINTED_GAINS[design]])
-    return StateFeedback(K)
+    return StateFeedback(computed_gain(design, plant) if gains == "computed" else np.array([PRINTED_GAINS[design]]))
 
 
 def controller(law: str, design: Design, plant: CartPole, gains: Gains = "printed") -> Hybrid:

@@ -1,13 +1,17 @@
 """What every design function does with its arguments: matrices of one floating dtype, of shapes that fit."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from cpjax.errors import InputError
-from cpjax.pytree import is_traced
+from cpjax.pytree import Array, is_traced
+
+MatrixLike: TypeAlias = Array | Sequence[Sequence[float]] | Sequence[float]
+"""A matrix as an array or as a nested list; a plain list where one column is meant."""
 
 
 def matrices(**given: Any) -> list[jax.Array]:

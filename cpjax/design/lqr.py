@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import jax
 
+from cpjax.design.arguments import MatrixLike
 from cpjax.design.riccati import solve_care, solve_dare
-from cpjax.pytree import Array
 
 
 class LinearQuadratic(NamedTuple):
@@ -17,7 +17,7 @@ class LinearQuadratic(NamedTuple):
     """Shape (n, n)."""
 
 
-def lqr(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -> LinearQuadratic:
+def lqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> LinearQuadratic:
     """The gain that minimises the integral of s' Q s + 2 s' N u + u' R u under s' = A s + B u.
 
     K depends on the ratio of the weights alone: (c Q, c R, c N) gives the same K for any c > 0, and c P.
@@ -36,7 +36,7 @@ def lqr(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -> Linea
     return LinearQuadratic(K, P)
 
 
-def dlqr(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -> LinearQuadratic:
+def dlqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> LinearQuadratic:
     """The gain that minimises the sum of s' Q s + 2 s' N u + u' R u under s[k+1] = A s[k] + B u[k]; as `lqr`."""
     P, K, _ = solve_dare(A, B, Q, R, N)
     return LinearQuadratic(K, P)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from cpjax.design.arguments import matrices, shaped, square
+from cpjax.design.arguments import MatrixLike, matrices, shaped, square
 from cpjax.errors import InputError
 from cpjax.numeric import double_word as dw
 from cpjax.numeric.double_word import double_word
@@ -30,7 +30,7 @@ from cpjax.numeric.small_matrices import (
     product,
     transpose,
 )
-from cpjax.pytree import Array, is_traced
+from cpjax.pytree import is_traced
 
 _MOST_DOUBLINGS = 60
 _SMALL = 1e-12  # of the doubled A, when what is missing from the sum is of the order of its square
@@ -43,7 +43,7 @@ class Sum(NamedTuple):
     stable: jax.Array
 
 
-def lyapunov(A: Array, Q: Array) -> jax.Array:
+def lyapunov(A: MatrixLike, Q: MatrixLike) -> jax.Array:
     """X (n, n) of A' X + X A + Q = 0 for a stable A, all of whose eigenvalues have negative real parts.
 
     Differentiable to any order. Under jit, an unstable A gives NaN.
@@ -58,7 +58,7 @@ def lyapunov(A: Array, Q: Array) -> jax.Array:
     return _solved(A, Q, lyapunov_equation, "of a stable system: every eigenvalue with a negative real part")
 
 
-def stein(A: Array, Q: Array) -> jax.Array:
+def stein(A: MatrixLike, Q: MatrixLike) -> jax.Array:
     """X (n, n) of A' X A - X + Q = 0 for a stable A, all of whose eigenvalues are inside the unit circle.
 
     Differentiable to any order. Under jit, an unstable A gives NaN.
@@ -73,7 +73,7 @@ def stein(A: Array, Q: Array) -> jax.Array:
     return _solved(A, Q, stein_equation, "of a stable system: every eigenvalue inside the unit circle")
 
 
-def _solved(A: Array, Q: Array, equation: Callable[..., jax.Array], allowed: str) -> jax.Array:
+def _solved(A: MatrixLike, Q: MatrixLike, equation: Callable[..., jax.Array], allowed: str) -> jax.Array:
     A, Q = matrices(A=A, Q=Q)
     shaped("Q", Q, (square("A", A),) * 2)
     X = equation(A, Q)
@@ -132,6 +132,7 @@ def cayley_shift(A: Matrix) -> jax.Array:
 
 
 @batch_last
+@jax.jit
 def _lyapunov(A: Matrix, Q: Matrix) -> Matrix:
     X, stable = sum_continuous(A, Q)
     a, x = double_word(A), double_word(X)
@@ -141,6 +142,7 @@ def _lyapunov(A: Matrix, Q: Matrix) -> Matrix:
 
 
 @batch_last
+@jax.jit
 def _stein(A: Matrix, Q: Matrix) -> Matrix:
     X, stable = sum_discrete(A, Q)
     a, x = double_word(A), double_word(X)

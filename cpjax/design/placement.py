@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from cpjax.design.arguments import column, matrices, shaped, square
+from cpjax.design.arguments import MatrixLike, column, matrices, shaped, square
 from cpjax.errors import InputError
 from cpjax.numeric import double_word as dw
 from cpjax.numeric.double_word import DoubleWord, double_word
@@ -36,7 +36,7 @@ from cpjax.numeric.transforms import from_positive, positive
 from cpjax.pytree import Array, is_traced
 
 
-def place(A: Array, B: Array, poles: Array | Sequence[complex]) -> jax.Array:
+def place(A: MatrixLike, B: MatrixLike, poles: Array | Sequence[complex]) -> jax.Array:
     """The gain K (1, n) of u = -K s that gives A - B K these eigenvalues; see `place_polynomial`.
 
     Args:
@@ -54,7 +54,7 @@ def place(A: Array, B: Array, poles: Array | Sequence[complex]) -> jax.Array:
     return place_polynomial(A, B, coefficients.astype(A.dtype))
 
 
-def place_polynomial(A: Array, B: Array, coefficients: Array) -> jax.Array:
+def place_polynomial(A: MatrixLike, B: MatrixLike, coefficients: Array | Sequence[float]) -> jax.Array:
     """The gain K (1, n) of u = -K s that gives A - B K this characteristic polynomial.
 
     Differentiable to any order in all arguments.
@@ -90,7 +90,8 @@ def polynomial_from_poles(poles: Array | Sequence[complex]) -> jax.Array:
         except (TypeError, ValueError) as problem:
             raise InputError("poles", poles, "a sequence of numbers") from problem
     poles = jnp.asarray(poles)
-    poles = poles.astype(jnp.result_type(poles, jnp.complex64) if jnp.iscomplexobj(poles) else jnp.result_type(float))
+    kind = jax.dtypes.canonicalize_dtype(poles.dtype)
+    poles = poles.astype(kind if jnp.issubdtype(kind, jnp.inexact) else jnp.result_type(float))
     if poles.ndim != 1 or poles.shape[0] == 0:
         raise InputError("poles", f"array of shape {poles.shape}", "of shape (n,); batches go through jax.vmap")
     whole = jnp.ones((1,), dtype=poles.dtype)
@@ -163,7 +164,7 @@ class QuadraticFactors(NamedTuple):
 
     def poles(self) -> jax.Array:
         """The complex roots (n,), to read: they have no derivative where two of them meet [1/s]."""
-        root = jnp.sqrt((self.a * self.a / 4 - self.b).astype(jnp.result_type(self.a, jnp.complex64)))
+        root = jnp.sqrt(lax.complex(self.a * self.a / 4 - self.b, jnp.zeros_like(self.a)))
         return jnp.concatenate([root - self.a / 2, -root - self.a / 2, -self.c.astype(root.dtype)])
 
 
@@ -175,6 +176,7 @@ def _radius(coefficients: jax.Array) -> jax.Array:
 
 
 @batch_last
+@jax.jit
 def _ackermann(A: Matrix, B: Matrix, coefficients: jax.Array) -> Matrix:
     n = A.shape[0]
     a, krylov = double_word(A), [double_word(B)]

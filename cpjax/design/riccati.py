@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from cpjax.design.arguments import matrices, shaped, square
+from cpjax.design.arguments import MatrixLike, matrices, shaped, square
 from cpjax.design.lyapunov import Sum, cayley_shift, lyapunov_equation, stein_equation, sum_continuous, sum_discrete
 from cpjax.errors import InputError
 from cpjax.numeric import double_word as dw
@@ -46,7 +46,7 @@ from cpjax.numeric.small_matrices import (
     symmetric,
     transpose,
 )
-from cpjax.pytree import Array, is_traced
+from cpjax.pytree import is_traced
 
 _MOST_DOUBLINGS = 60
 _MOST_CORRECTIONS = 12
@@ -63,17 +63,19 @@ class RiccatiSolution(NamedTuple):
     found: jax.Array
 
 
-def care(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -> jax.Array:
+def care(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> jax.Array:
     """P (n, n) of the continuous-time algebraic Riccati equation; see `solve_care`."""
     return solve_care(A, B, Q, R, N).P
 
 
-def dare(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -> jax.Array:
+def dare(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> jax.Array:
     """P (n, n) of the discrete-time algebraic Riccati equation; see `solve_dare`."""
     return solve_dare(A, B, Q, R, N).P
 
 
-def solve_care(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -> RiccatiSolution:
+def solve_care(
+    A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None
+) -> RiccatiSolution:
     """The stabilising solution of the continuous-time Riccati equation, with its gain.
 
     Differentiable to any order in all arguments. Only the symmetric parts of Q and R count.
@@ -93,12 +95,16 @@ def solve_care(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -
     return _solved(_continuous, "continuous", A, B, Q, R, N)
 
 
-def solve_dare(A: Array, B: Array, Q: Array, R: Array, N: Array | None = None) -> RiccatiSolution:
+def solve_dare(
+    A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None
+) -> RiccatiSolution:
     """The stabilising solution of the discrete-time Riccati equation, with its gain; as `solve_care`."""
     return _solved(_discrete, "discrete", A, B, Q, R, N)
 
 
-def _solved(equation: Callable[..., Any], time: str, A: Array, B: Array, Q: Array, R: Array, N: Any) -> RiccatiSolution:
+def _solved(
+    equation: Callable[..., Any], time: str, A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: Any
+) -> RiccatiSolution:
     given = {"A": A, "B": B, "Q": Q, "R": R} | ({} if N is None else {"N": N})
     A, B, Q, R, *cross = matrices(**given)
     n = square("A", A)
@@ -124,6 +130,7 @@ def _solved(equation: Callable[..., Any], time: str, A: Array, B: Array, Q: Arra
 
 
 @batch_last
+@jax.jit
 def _solve_continuous(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix]:
     a, b, q, r, cross = (double_word(x) for x in (A, B, Q, R, transpose(N)))
 
@@ -143,6 +150,7 @@ def _solve_continuous(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> 
 
 
 @batch_last
+@jax.jit
 def _solve_discrete(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix]:
     a, b, q, r, cross = (double_word(x) for x in (A, B, Q, R, transpose(N)))
 
@@ -223,7 +231,7 @@ def _double(E: Matrix, G: Matrix, H: Matrix, scale: jax.Array) -> _Start:
     E, G, H, _, _ = lax.while_loop(unfinished, double, (E, G, H, finished, jnp.zeros((), dtype=jnp.int32)))
     # Where an unstable mode cannot be moved or is not seen, H or G grows to where rounding stops it. The trace of
     # G H is the same in all coordinates of the state.
-    plausible = jnp.sum(G * H, axis=(0, 1)) < 0.01 / eps
+    plausible = jnp.abs(jnp.sum(G * H, axis=(0, 1))) < 0.01 / eps
     return _Start(H * scale, plausible)
 
 

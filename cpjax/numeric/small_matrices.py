@@ -178,6 +178,7 @@ def batch_last(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @batch_last
+@jax.jit
 def _solve(a: Matrix, b: Matrix) -> Matrix:
     return solve(a, b)
 

@@ -1,0 +1,264 @@
+"""The plant, the closed loop and the gain as objects of python-control, and its gains as laws.
+
+Signals carry cpjax's names and units: states x, x_dot, theta, theta_dot, input voltage. The equations of motion are
+`CartPole.acceleration`, evaluated in Python's floats: for one state at a time, as python-control's simulations ask for
+them, that takes a fraction of a call into JAX. Linear models, laws and gates do come out of JAX, in its default dtype:
+turn on float64.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, TypeAlias
+
+import control
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from cpjax.controllers.feedback import StateFeedback
+from cpjax.controllers.hybrid import Hybrid
+from cpjax.controllers.protocol import Controller, Law, SingleLaw, as_controller
+from cpjax.errors import InputError
+from cpjax.plant import CartPole, Motor, linearize
+from cpjax.pytree import Number, cast, check, is_traced
+from cpjax.sim.integrators import rk4
+from cpjax.sim.rollout import check_settings
+from cpjax.sim.stepper import applied_voltage, step_held
+from cpjax.state import NAMES, State
+
+Vector: TypeAlias = np.ndarray[Any, Any]
+
+MEASURED = ("x", "theta")
+"""What the paper measures, cart position and angle: the `outputs` of `state_space` when an observer is to follow."""
+
+_PERIOD = Number("s", "control period", above=0.0)
+_UNTRACEABLE = "JAX cannot trace through python-control"
+
+
+def state_space(
+    plant: CartPole,
+    equilibrium: Literal["upright", "hanging"] | State = "upright",
+    outputs: Sequence[str] = NAMES,
+) -> control.StateSpace:
+    """`cpjax.linearize` as a continuous-time `control.StateSpace` with input voltage, in deviations from `equilibrium`.
+
+    Args:
+      outputs: names of the states to put out, in order; `MEASURED` are the paper's.
+
+    Raises:
+      InputError: as `cpjax.linearize`; a plant or equilibrium that JAX is tracing; an output that is no state, or is
+        named twice.
+    """
+    model = linearize(_known_plant(plant), equilibrium)
+    if is_traced(model.A):
+        raise InputError("equilibrium", equilibrium, f"known; {_UNTRACEABLE}")
+    A, B = (np.asarray(M, dtype=np.float64) for M in model)
+    chosen = [outputs] if isinstance(outputs, str) else outputs
+    known = isinstance(chosen, (list, tuple)) and len(chosen) > 0 and all(name in NAMES for name in chosen)
+    if not known or len(set(chosen)) < len(chosen):
+        raise InputError("outputs", outputs, "different names out of " + ", ".join(NAMES))
+    C = np.eye(4)[[NAMES.index(name) for name in chosen]]
+    D = np.zeros((len(chosen), 1))
+    return control.StateSpace(A, B, C, D, states=list(NAMES), inputs=["voltage"], outputs=list(chosen))
+
+
+def plant_system(plant: CartPole) -> control.NonlinearIOSystem:
+    """The plant: input voltage, outputs and states x, x_dot, theta, theta_dot.
+
+    The motor clips the voltage, as everywhere in cpjax; python-control reports the one that was asked for.
+
+    Raises:
+      InputError: `plant` is no CartPole with known numbers.
+    """
+    plant = _known_plant(plant)
+    saturate = _saturation(plant.motor)
+
+    def update(t: float, state: Vector, inputs: Vector, params: Any) -> tuple[Any, ...]:
+        return _derivative(plant, state, saturate(float(inputs[0])))
+
+    return control.NonlinearIOSystem(
+        update, None, states=list(NAMES), inputs=["voltage"], outputs=list(NAMES), name="cart_pole"
+    )
+
+
+def closed_loop_system(
+    plant: CartPole, controller: Controller | Law, control_period: float | None = None, *, dt: float | None = None
+) -> control.NonlinearIOSystem:
+    """Plant and controller as one system without inputs. Outputs: the four states, the applied voltage, the mode.
+
+    Without a control period the system is continuous in time and in what the controller sees; the mode changes at the
+    boundary itself, not at the end of a step as in `cpjax.rollout`. The states are the plant's four.
+
+    With a control period the system is discrete, the sampled clock of `cpjax.rollout`: one update is one period, of
+    `control_period / dt` steps of the classical Runge-Kutta method under a held voltage. The states are the plant's
+    four and `mode`, the mode until now; its start is `controller.start_mode`, or simply 0 for a law or `cpjax.Hybrid`.
+    What a rollout would flag and stop is not stopped.
+
+    Args:
+      control_period: [s].
+      dt: the integrator's step [s], a whole fraction of `control_period`; by default all of it.
+
+    Raises:
+      InputError: bad arguments, named; `controller` without a control period, if it may remember its mode: laws
+        do not, nor does a `cpjax.Hybrid` whose gate has hysteresis 0.
+    """
+    plant, controller = _known_plant(plant), as_controller(controller)
+    _refuse_unknown("controller", controller)
+    if control_period is not None:
+        return _sampled_loop(plant, controller, control_period, dt)
+    if dt is not None:
+        raise InputError("dt", dt, "absent unless there is a control period")
+    if _may_remember(controller):
+        allowed = (
+            "a law, or a cpjax.Hybrid whose gate has hysteresis 0; one that remembers its mode needs a control_period"
+        )
+        raise InputError("controller", controller, allowed)
+    return _continuous_loop(plant, controller)
+
+
+def gain_array(law: StateFeedback) -> Vector:
+    """K of u = -K s as python-control writes it, an array (1, 4) [V per unit of state].
+
+    The law takes the angle modulo a turn, which a gain cannot: the two agree within half a turn of upright.
+
+    Raises:
+      InputError: `law` is no StateFeedback with known numbers, or its reference is not the origin; -K (s - s_ref) is
+        then affine, and no gain.
+    """
+    if not isinstance(law, StateFeedback):
+        raise InputError("law", law, "a cpjax.StateFeedback")
+    _refuse_unknown("law", law)
+    reference = [float(getattr(law.reference, name)) for name in NAMES]
+    if any(reference):
+        raise InputError("law.reference", law.reference, "the origin; no gain represents another")
+    return np.array(law.K, dtype=np.float64)
+
+
+def feedback_system(law: StateFeedback) -> control.StateSpace:
+    """The law as a static system from the states to the voltage, D = -K. Arguments and errors as for `gain_array`."""
+    return control.StateSpace([], [], [], -gain_array(law), inputs=list(NAMES), outputs=["voltage"])
+
+
+def state_feedback(gain: Any) -> StateFeedback:
+    """The law u = -K s of a gain that python-control computed.
+
+    Args:
+      gain: K (1, 4) or (4,) [V per unit of state], such as the first of what `control.lqr` returns or what
+        `control.place` does; or a static `control.StateSpace` from the four states to one voltage, D = -K, whose inputs
+        may be in any order if they bear the states' names.
+
+    Raises:
+      InputError: anything else, or a gain that is not finite.
+    """
+    if isinstance(gain, control.StateSpace):
+        if gain.nstates or gain.D.shape != (1, 4):
+            raise InputError("gain", gain, "static, from four states to one voltage")
+        named = set(gain.input_labels) == set(NAMES)
+        return StateFeedback(-np.asarray(gain.D)[:, [gain.input_labels.index(n) for n in NAMES] if named else range(4)])
+    allowed = "an array of shape (1, 4) of known real numbers [V per unit of state]"
+    try:
+        K = np.asarray(gain)
+    except (TypeError, ValueError) as problem:  # JAX is tracing, or uneven, such as all that control.lqr returns
+        raise InputError("gain", gain, allowed) from problem
+    if K.shape not in ((1, 4), (4,)) or K.dtype.kind not in "fiu":
+        raise InputError("gain", gain, allowed)
+    return StateFeedback(K.astype(np.float64))
+
+
+def _derivative(plant: CartPole, state: Vector, voltage: float) -> tuple[Any, ...]:
+    """`CartPole.vector_field` under the applied voltage [V], in Python's floats, which the plant must hold too."""
+    _, x_dot, theta, theta_dot = state.tolist()
+    force = plant.motor.force(voltage, x_dot)
+    x_ddot, theta_ddot = plant.acceleration(math.sin(theta), math.cos(theta), (x_dot, theta_dot), force)
+    return x_dot, x_ddot, theta_dot, theta_ddot
+
+
+def _saturation(motor: Motor) -> Callable[[float], float]:
+    """`motor.saturate` for Python's floats; that of cpjax's own motor without a call into JAX. NaN stays NaN."""
+    if type(motor) is not Motor:
+        return lambda voltage: float(motor.saturate(voltage))
+    limit = float(motor.voltage_limit)
+    return lambda voltage: max(min(voltage, limit), -limit)
+
+
+def _continuous_loop(plant: CartPole, controller: Controller) -> control.NonlinearIOSystem:
+    dtype = jnp.result_type(float)
+    arrays, controller = cast((plant, controller), dtype)
+
+    @jax.jit
+    def act(vector: jax.Array) -> jax.Array:
+        state = State.from_vector(vector.astype(dtype))
+        mode = controller.start_mode(state)
+        return jnp.stack([applied_voltage(arrays, controller, state, mode), mode.astype(dtype)])
+
+    def update(t: float, state: Vector, inputs: Vector, params: Any) -> tuple[Any, ...]:
+        return _derivative(plant, state, np.asarray(act(state))[0].item())
+
+    return _loop_system(update, act, NAMES, 0)
+
+
+def _sampled_loop(plant: CartPole, controller: Controller, period: Any, dt: Any) -> control.NonlinearIOSystem:
+    if is_traced(period) or np.ndim(period):
+        raise InputError("control_period", period, _PERIOD.allowed())
+    period = float(_PERIOD.normalise("control_period", period))
+    dt = period if dt is None else dt
+    steps = check_settings(dt, dt, "sampled", period, "per_step", "rk4", None).steps_per_control
+    dtype = jnp.result_type(float)
+    plant, controller, step = cast((plant, controller, float(dt)), dtype)
+
+    def observe(vector: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+        state = State.from_vector(vector[:4].astype(dtype))
+        mode = controller.next_mode(state, vector[4].astype(jnp.int32))
+        return state, applied_voltage(plant, controller, state, mode), mode.astype(dtype)
+
+    @jax.jit
+    def act(vector: jax.Array) -> jax.Array:
+        return jnp.stack(observe(vector)[1:])
+
+    @jax.jit
+    def advance(vector: jax.Array) -> jax.Array:
+        state, voltage, mode = observe(vector)
+        state = lax.fori_loop(0, steps, lambda _, state: step_held(plant, rk4, state, voltage, step), state)
+        return jnp.append(state.vector(), mode)
+
+    def update(t: float, state: Vector, inputs: Vector, params: Any) -> Vector:
+        return np.asarray(advance(state))
+
+    return _loop_system(update, act, (*NAMES, "mode"), period)
+
+
+def _loop_system(
+    update: Callable[..., Any], act: Callable[[Any], jax.Array], states: Sequence[str], dt: float
+) -> control.NonlinearIOSystem:
+    """`act` gives the applied voltage and the mode at a system's state."""
+
+    def output(t: float, state: Vector, inputs: Vector, params: Any) -> Vector:
+        return np.concatenate([state[:4], act(state)])
+
+    outputs = [*NAMES, "voltage", "mode"]
+    return control.NonlinearIOSystem(
+        update, output, states=list(states), inputs=[], outputs=outputs, dt=dt, name="closed_loop"
+    )
+
+
+def _may_remember(controller: Controller) -> bool:
+    """Whether `next_mode` may depend on the mode until now; of a stranger's gate or controller nothing is known."""
+    if isinstance(controller, SingleLaw):
+        return False
+    hysteresis = getattr(controller.gate, "hysteresis", None) if isinstance(controller, Hybrid) else None
+    return hysteresis is None or float(hysteresis) != 0.0
+
+
+def _known_plant(plant: Any) -> CartPole:
+    """`plant` with Python's floats for numbers."""
+    if not isinstance(plant, CartPole):
+        raise InputError("plant", plant, "a cpjax.CartPole")
+    _refuse_unknown("plant", plant)
+    return jax.tree.map(float, plant)
+
+
+def _refuse_unknown(name: str, tree: Any) -> None:
+    check(name, tree)
+    if any(is_traced(leaf) for leaf in jax.tree.leaves(tree)):
+        raise InputError(name, tree, f"of known numbers; {_UNTRACEABLE}")

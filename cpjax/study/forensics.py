@@ -1,0 +1,403 @@
+"""Where printed gains come from: the plant parameters that explain them, and what the gains say about a plant at all.
+
+Given gains with the digits they were printed with, and the weights or poles they were designed for, the audit takes a
+plant, lets one parameter change, then each pair of parameters, and so on, and asks whether the gains follow. The fits
+are Gauss and Newton's, damped by Levenberg and Marquardt, on derivatives through `linearize`, `lqr` and
+`place_polynomial`, from many random starts at once. Residuals are in units of the last printed digit: rounding alone
+leaves at most 0.5.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from cpjax import io, paper
+from cpjax.design.lqr import lqr
+from cpjax.design.placement import place_polynomial, polynomial_from_poles
+from cpjax.errors import InputError
+from cpjax.plant import CartPole, Motor, linearize
+from cpjax.pytree import Number, rules
+
+PARAMETERS = tuple(
+    name
+    for cls in (CartPole, Motor)
+    for name, rule in rules(cls).items()
+    if isinstance(rule, Number) and name != "voltage_limit"
+)
+"""Every number of a plant that its linear model may depend on."""
+
+EXPLAINED = 1.0
+"""Worst residual, in units of the last digit, up to which gains count as explained: rounding twice is 1.0."""
+
+_STEPS = 40
+_START_FACTOR = 3.0
+Progress: TypeAlias = Callable[[int, int, str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class PrintedGain:
+    """A gain as printed, and what it was designed for: weights or poles.
+
+    Attributes:
+      gain: four numbers, K of u = -K s.
+      unit: the size of the last printed digit of each.
+      poles: what it places, or None.
+      Q: diagonal of the state weight, or None.
+      R: weight of the voltage, or None.
+    """
+
+    gain: tuple[float, ...]
+    unit: tuple[float, ...]
+    poles: tuple[complex, ...] | None = None
+    Q: tuple[float, ...] | None = None
+    R: float | None = None
+
+    @classmethod
+    def placement(cls, texts: Sequence[str], poles: Sequence[complex]) -> "PrintedGain":
+        """A gain of pole placement, from its numbers as printed: the digits say how precise they are."""
+        gain, unit = _parsed("placement gain", texts)
+        if len(poles) != 4:
+            raise InputError("poles", poles, "four of them")
+        polynomial_from_poles(poles)
+        return cls(gain, unit, poles=tuple(complex(p) for p in poles))
+
+    @classmethod
+    def lqr(cls, texts: Sequence[str], Q: Sequence[float], R: float) -> "PrintedGain":
+        """A gain of a linear quadratic regulator with Q = diag(...), from its numbers as printed."""
+        gain, unit = _parsed("lqr gain", texts)
+        if len(Q) != 4 or not all(math.isfinite(q) and q >= 0.0 for q in Q):
+            raise InputError("Q", Q, "four finite numbers, at least 0: the diagonal")
+        if not (math.isfinite(R) and R > 0.0):
+            raise InputError("R", R, "a finite number above 0")
+        return cls(gain, unit, Q=tuple(float(q) for q in Q), R=float(R))
+
+    @property
+    def design(self) -> str:
+        """Which of the two."""
+        return "placement" if self.poles is not None else "lqr"
+
+    def computed(self, plant: CartPole) -> jax.Array:
+        """The gain (4,) that the poles or weights give on `plant`."""
+        A, B = linearize(plant)
+        if self.poles is not None:
+            return place_polynomial(A, B, polynomial_from_poles(self.poles).astype(A.dtype))[0]
+        assert self.Q is not None
+        return lqr(A, B, jnp.diag(jnp.asarray(self.Q, dtype=A.dtype)), jnp.asarray([[self.R]], dtype=A.dtype)).K[0]
+
+
+def printed_in_the_paper() -> list[PrintedGain]:
+    """The paper's two gains, with two decimals each (sections IV-A and IV-B)."""
+
+    def texts(design: paper.Design) -> list[str]:
+        return [f"{k:.2f}" for k in paper.PRINTED_GAINS[design]]
+
+    return [PrintedGain.placement(texts("placement"), paper.POLES), PrintedGain.lqr(texts("lqr"), paper.Q, paper.R)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """The best that changing some of a plant's parameters does for the gains.
+
+    Attributes:
+      parameters: which may change.
+      values: what they become.
+      residuals: computed less printed gain, in units of the last digit, all gains in a row.
+      reached: share of the random starts that end there (in cost, within 1 % or 0.01 of the best).
+    """
+
+    parameters: tuple[str, ...]
+    values: tuple[float, ...]
+    residuals: tuple[float, ...]
+    reached: float
+
+    @property
+    def worst(self) -> float:
+        """The largest residual, in units of the last digit."""
+        return max(abs(r) for r in self.residuals)
+
+    @property
+    def explains(self) -> bool:
+        """Whether every gain follows."""
+        return self.worst <= EXPLAINED
+
+
+@dataclasses.dataclass(frozen=True)
+class Direction:
+    """A combination of parameters, and how well the gains know it.
+
+    Attributes:
+      sensitivity: singular value: units of the last digit by which the gains move, for a relative change by 1.
+      weights: the relative change of each parameter, by name; their squares sum to 1.
+    """
+
+    sensitivity: float
+    weights: Mapping[str, float]
+
+    @property
+    def known_to(self) -> float:
+        """The relative change that moves the gains by half a unit: less than that, nobody can tell."""
+        return 0.5 / self.sensitivity if self.sensitivity > 0.0 else math.inf
+
+    @property
+    def identified(self) -> bool:
+        """Whether the gains fix the combination at all, to better than 10 %."""
+        return self.known_to < 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class GainAudit:
+    """What `audit_gains` found.
+
+    Attributes:
+      unchanged: residuals with the plant as it is, in units of the last digit.
+      fits: for each set of parameters that may change, smallest sets first.
+      directions: combinations of all parameters at the best fit of the smallest sets that explain the gains (or of the
+        best fit, if none does), best known first.
+      plant: the plant of that fit.
+    """
+
+    unchanged: tuple[float, ...]
+    fits: tuple[Fit, ...]
+    directions: tuple[Direction, ...]
+    plant: CartPole
+
+    def best(self, size: int) -> Fit:
+        """The best fit among the sets of `size` parameters."""
+        return min((fit for fit in self.fits if len(fit.parameters) == size), key=lambda fit: fit.worst)
+
+    @property
+    def simplest(self) -> tuple[Fit, ...]:
+        """The fits that explain the gains with the fewest changes, best first; empty if none does."""
+        explaining = [fit for fit in self.fits if fit.explains]
+        fewest = min((len(fit.parameters) for fit in explaining), default=0)
+        return tuple(sorted((f for f in explaining if len(f.parameters) == fewest), key=lambda fit: fit.worst))
+
+
+def audit_gains(
+    prints: Sequence[PrintedGain],
+    plant: CartPole,
+    *,
+    parameters: Sequence[str] = PARAMETERS,
+    most: int = 2,
+    starts: int = 128,
+    seed: int = 1,
+    progress: Progress | None = None,
+) -> GainAudit:
+    """Which changes of `plant` explain the gains, and which combinations of parameters the gains know.
+
+    Args:
+      parameters: those that may change, by name (of `PARAMETERS`).
+      most: how many may change at once; every set of up to so many is tried.
+      starts: random starts for each set, each parameter within a factor of 3 of the plant's value. A parameter that is
+        zero in the plant starts within that factor of a size typical of the plant.
+      seed: of the starts.
+      progress: called with how much is done, of how much, and what comes next.
+
+    Raises:
+      InputError: no gain, an unknown parameter, or a count below 1.
+    """
+    if not prints:
+        raise InputError("prints", prints, "one printed gain or more")
+    unknown = [name for name in parameters if name not in PARAMETERS]
+    if unknown or len(set(parameters)) < len(parameters) or not parameters:
+        raise InputError("parameters", unknown or parameters, "different ones of " + ", ".join(PARAMETERS))
+    for field, value, top in (("most", most, len(parameters)), ("starts", starts, 100_000)):
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= top:
+            raise InputError(field, value, f"a whole number from 1 to {top}")
+    base = np.array([_scale(plant, name) for name in parameters])
+    names = tuple(parameters)
+    fits: list[Fit] = []
+    generator = np.random.default_rng(seed)
+    total = sum(math.comb(len(names), size) for size in range(1, most + 1))
+    for size in range(1, most + 1):
+        sets = list(itertools.combinations(range(len(names)), size))
+        if progress is not None:
+            progress(len(fits), total, f"{len(sets)} sets of {size}, {starts} starts each")
+        spread = math.log(_START_FACTOR)
+        x = generator.uniform(-spread, spread, (len(sets), starts, size))
+        fits += _fit_all(tuple(prints), plant, names, base, sets, x)
+    if progress is not None:
+        progress(total, total, "singular values")
+    audit = GainAudit(_residuals_of(prints, plant), tuple(fits), (), plant)
+    chosen = audit.simplest[0] if audit.simplest else min(fits, key=lambda fit: fit.worst)
+    found = _changed(plant, dict(zip(chosen.parameters, chosen.values, strict=True)))
+    return dataclasses.replace(audit, directions=_directions(tuple(prints), found, names), plant=found)
+
+
+def document(audit: GainAudit, prints: Sequence[PrintedGain], plant: CartPole, **setting: Any) -> dict[str, Any]:
+    """The audit as plain values, for JSON."""
+
+    def row(fit: Fit) -> dict[str, Any]:
+        return {**dataclasses.asdict(fit), "worst": fit.worst, "explains": fit.explains}
+
+    return {
+        "what": "which changes of a plant explain printed gains; residuals in units of the last printed digit",
+        "versions": io.versions(),
+        "setting": setting,
+        "printed": [{key: _plain(value) for key, value in dataclasses.asdict(p).items()} for p in prints],
+        "plant": io.encode(plant),
+        "unchanged": audit.unchanged,
+        "fits": [row(fit) for fit in audit.fits],
+        "simplest": [row(fit) for fit in audit.simplest],
+        "found": io.encode(audit.plant),
+        "directions": [
+            {**dataclasses.asdict(d), "known_to": d.known_to, "identified": d.identified} for d in audit.directions
+        ],
+    }
+
+
+def write(path: Path, audit: GainAudit, prints: Sequence[PrintedGain], plant: CartPole, **setting: Any) -> None:
+    """Writes `document` as JSON, atomically."""
+    io.write_json(path, document(audit, prints, plant, **setting))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
+    return str(value) if isinstance(value, complex) else value
+
+
+def _parsed(field: str, texts: Sequence[str]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Numbers as printed, and the sizes of their last digits."""
+    if len(texts) != 4:
+        raise InputError(field, texts, "four numbers as printed")
+    values, units = [], []
+    for text in texts:
+        mantissa, _, exponent = text.strip().lower().partition("e")
+        try:
+            value, power = float(text), int(exponent or 0)
+        except ValueError as problem:
+            raise InputError(field, text, "a number as printed, such as -24.70") from problem
+        if not math.isfinite(value):
+            raise InputError(field, text, "a finite number")
+        values.append(value)
+        units.append(10.0 ** (power - len(mantissa.partition(".")[2])))
+    return tuple(values), tuple(units)
+
+
+def _value(plant: CartPole, name: str) -> float:
+    return float(getattr(plant.motor if name in rules(Motor) else plant, name))
+
+
+def _scale(plant: CartPole, name: str) -> float:
+    """The parameter's value; where it is zero, one at which it would matter on this plant."""
+    swing = float(plant.pole_mass) * float(plant.pole_length) ** 2
+    typical = {
+        "pole_inertia": swing,
+        "cart_friction": float(plant.motor.damping),
+        "viscous_friction": float(plant.motor.damping) * (plant.motor.wheel_radius / plant.motor.gear_ratio) ** 2,
+        "pivot_friction": swing * math.sqrt(float(plant.gravity) / float(plant.pole_length)),
+        "rotor_inertia": float(plant.cart_mass) * (plant.motor.wheel_radius / plant.motor.gear_ratio) ** 2,
+        "back_emf_constant": float(plant.motor.torque_constant),
+    }
+    return _value(plant, name) or typical[name] or 1.0
+
+
+def _changed(plant: CartPole, changes: Mapping[str, Any]) -> CartPole:
+    motor = {key: value for key, value in changes.items() if key in rules(Motor)}
+    own = {key: value for key, value in changes.items() if key not in motor}
+    return dataclasses.replace(plant, **own, motor=dataclasses.replace(plant.motor, **motor))
+
+
+def _residuals(prints: Sequence[PrintedGain], plant: CartPole) -> jax.Array:
+    gains = jnp.concatenate([p.computed(plant) for p in prints])
+    printed = jnp.asarray([k for p in prints for k in p.gain], dtype=gains.dtype)
+    return (gains - printed) / jnp.asarray([u for p in prints for u in p.unit], dtype=gains.dtype)
+
+
+def _residuals_of(prints: Sequence[PrintedGain], plant: CartPole) -> tuple[float, ...]:
+    return tuple(float(r) for r in jax.jit(lambda p: _residuals(prints, p))(plant))
+
+
+def _fit_all(
+    prints: tuple[PrintedGain, ...],
+    plant: CartPole,
+    names: tuple[str, ...],
+    base: np.ndarray[Any, Any],
+    sets: Sequence[tuple[int, ...]],
+    starts: np.ndarray[Any, Any],
+) -> list[Fit]:
+    """The best of all starts for each set of parameters; `starts` (sets, starts, size) are logarithms of factors."""
+
+    def values(chosen: jax.Array, x: jax.Array) -> jax.Array:
+        """The chosen parameters after the change."""
+        return jnp.asarray(base, dtype=x.dtype)[chosen] * jnp.exp(x)
+
+    own = jnp.asarray([_value(plant, name) for name in names])
+
+    def residuals(chosen: jax.Array, x: jax.Array) -> jax.Array:
+        changed = own.at[chosen].set(values(chosen, x))
+        return _residuals(prints, _changed(plant, dict(zip(names, changed, strict=True))))
+
+    def one(chosen: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        x = _least_squares(lambda x: residuals(chosen, x), x)
+        return values(chosen, x), residuals(chosen, x)
+
+    count, each, size = starts.shape
+    lanes = jnp.repeat(jnp.asarray(sets), each, axis=0), jnp.asarray(starts).reshape(-1, size)
+    found, rest = (np.asarray(a).reshape(count, each, -1) for a in jax.jit(jax.vmap(one))(*lanes))
+    cost = np.where(np.isfinite(rest).all(axis=-1), np.sum(rest**2, axis=-1), np.inf)
+    fits = []
+    for row, chosen in enumerate(sets):
+        best = int(np.argmin(cost[row]))
+        lowest = cost[row, best]
+        reached = float(np.mean(cost[row] <= lowest + np.maximum(0.01 * lowest, 0.01)))
+        fits.append(
+            Fit(
+                tuple(names[i] for i in chosen),
+                tuple(float(v) for v in found[row, best]),
+                tuple(float(r) for r in rest[row, best]),
+                reached,
+            )
+        )
+    return fits
+
+
+def _least_squares(residuals: Callable[[jax.Array], jax.Array], x: jax.Array) -> jax.Array:
+    """Minimises the residuals' sum of squares by Levenberg and Marquardt's method, from x (n,)."""
+
+    def cost(x: jax.Array) -> jax.Array:
+        r = residuals(x)
+        return jnp.sum(r * r)
+
+    def step(carry: tuple[jax.Array, jax.Array, jax.Array], _: None) -> tuple[Any, None]:
+        x, now, damping = carry
+        r = residuals(x)
+        J = jax.jacfwd(residuals)(x)
+        H = J.T @ J
+        damped = H + damping * jnp.diag(jnp.diagonal(H) + np.finfo(x.dtype).tiny)
+        # A relative change by more than e in one step leaves the region where a derivative means something.
+        trial = x - jnp.clip(jnp.linalg.solve(damped, J.T @ r), -1.0, 1.0)
+        then = cost(trial)
+        better = then < now  # False for NaN
+        kept = jnp.where(better, trial, x), jnp.where(better, then, now)
+        return (*kept, jnp.clip(jnp.where(better, damping / 5.0, damping * 4.0), 1e-12, 1e8)), None
+
+    (x, _, _), _ = lax.scan(step, (x, cost(x), jnp.asarray(1e-2, dtype=x.dtype)), length=_STEPS)
+    return x
+
+
+def _directions(prints: tuple[PrintedGain, ...], plant: CartPole, names: tuple[str, ...]) -> tuple[Direction, ...]:
+    """Singular values and vectors of the gains' dependence on the logarithms of all parameters, at `plant`."""
+    sizes = jnp.asarray([_scale(plant, name) for name in names])
+    own = jnp.asarray([_value(plant, name) for name in names])
+
+    def residuals(x: jax.Array) -> jax.Array:
+        return _residuals(prints, _changed(plant, dict(zip(names, own + sizes * x, strict=True))))
+
+    J = np.asarray(jax.jit(jax.jacfwd(residuals))(jnp.zeros_like(sizes)))
+    _, values, vectors = np.linalg.svd(J, full_matrices=True)
+    values = np.concatenate([values, np.zeros(len(names))])[: len(names)]
+    values = np.where(values < 1e-9 * values[0], 0.0, values)  # rounding
+    return tuple(
+        Direction(float(s), {name: float(w) for name, w in zip(names, v, strict=True)})
+        for s, v in zip(values, vectors, strict=True)
+    )
