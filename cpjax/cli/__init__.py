@@ -18,12 +18,13 @@ exit codes:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, wants options in full, and takes `-5e-3` for a number."""
+    """Says what is wrong in one line, wants options in full, and takes `-5e-3` and `-5+2j` for numbers."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **{"allow_abbrev": False, **options})
-        # argparse's own pattern knows no exponent, and there is no public way to change it.
-        self._negative_number_matcher = re.compile(r"-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$|-inf$|-nan$")
+        # argparse's own pattern knows neither exponents nor complex numbers, and there is no public way to change it.
+        real = r"(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
+        self._negative_number_matcher = re.compile(rf"-{real}([-+]{real}[ij]|[ij])?$|-inf$|-nan$")
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {message}\n")
@@ -31,7 +32,7 @@ class _Parser(argparse.ArgumentParser):
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    from cpjax.cli import report, reproduce, swingup
+    from cpjax.cli import audit_gains, report, reproduce, swingup
 
     parser = _Parser(
         prog="cpjax",
@@ -41,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
-    for module in (swingup, reproduce, report):
+    for module in (swingup, reproduce, audit_gains, report):
         module.add_command(commands)
     return parser
 

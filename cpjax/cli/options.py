@@ -11,12 +11,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from cpjax import io, paper
 from cpjax.controllers import AngleGate, AngleRateGate, EnergySwingUp, Hybrid, LyapunovGate, StateFeedback
 from cpjax.controllers.gates import Gate
 from cpjax.controllers.protocol import Controller, as_controller
+from cpjax.design.lqr import lqr
+from cpjax.design.placement import place
 from cpjax.errors import InputError
-from cpjax.plant import CartPole, Motor
+from cpjax.plant import CartPole, Motor, linearize
 from cpjax.pytree import Number, rules
 from cpjax.sim.integrators import INTEGRATORS
 from cpjax.starts import START_SETS, sample_starts
@@ -72,12 +76,15 @@ CONTROLLER_OPTIONS = [
         "the paper's, or computed for the plant (default printed)",
         choices=("printed", "computed"),
     ),
-    Option("controller", "K", "the regulator's gain itself, instead of design and gains", float, count=4, flag="gain"),
+    Option("controller", "Q", "LQR for the plant: diagonal of the state weight", float, count=4, flag="q"),
+    Option("controller", "R", "and the weight of the voltage (default the paper's 1e-4)", float, flag="r"),
+    Option("controller", "poles", "placement for the plant: poles, such as -3 -4 -5+2j -5-2j", count=4),
+    Option("controller", "K", "the regulator's gain itself, instead of all these", float, count=4, flag="gain"),
     *_numbers_of("controller", EnergySwingUp),
     Option(
         "controller",
         "gate",
-        "where the regulator takes over (default angle); lyapunov is a level set of the paper's LQR and needs --level",
+        "where the regulator takes over (default angle); lyapunov: a level set of the LQR of q, r; needs --level",
         choices=tuple(_GATES),
     ),
     *_numbers_of("controller", AngleRateGate),
@@ -212,22 +219,56 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
             raise InputError(key, law_changes[key], f"absent: the law {name} has no such term")
     swing_up = dataclasses.replace(law, **law_changes)
     reference = State(changes.pop("reference_x", 0.0), 0.0, 0.0, 0.0)
+    weights: dict[str, Any] = {key: changes[key] for key in ("Q", "R") if key in changes}
     regulator = _build_regulator(changes, plant, reference)
-    gate = _build_gate(changes, plant, reference)
+    gate = _build_gate(changes, plant, reference, weights)
     return Hybrid(swing_up, regulator, gate)
 
 
 def _build_regulator(changes: dict[str, Any], plant: CartPole, reference: State) -> StateFeedback:
-    K = changes.pop("K", None)
-    design, gains = changes.pop("design", None), changes.pop("gains", None)
+    given = {key: changes.pop(key) for key in ("K", "design", "gains", "Q", "R", "poles") if key in changes}
+    weights: dict[str, Any] = {key: given[key] for key in ("Q", "R") if key in given}
+    K, poles = given.get("K"), given.get("poles")
     if K is not None:
-        if design is not None or gains is not None:
-            raise InputError("gain", K, "absent where design or gains is given")
+        if len(given) > 1:
+            raise InputError("gain", K, "absent where " + " or ".join(k for k in given if k != "K") + " is given")
         return StateFeedback(K, reference)
-    return StateFeedback(paper.regulator(design or "placement", gains or "printed", plant).K, reference)
+    if poles is not None or weights:
+        design = "placement" if poles is not None else "lqr"
+        asked = given.get("design", design)
+        if asked != design or (poles is not None and weights):
+            raise InputError("design", asked, "placement with poles, or lqr with Q and R")
+        if given.get("gains", "computed") != "computed":
+            raise InputError("gains", given["gains"], "computed, where poles or weights are given")
+        A, B = linearize(plant)
+        if poles is not None:
+            return StateFeedback(place(A, B, parse_poles(poles)), reference)
+        return StateFeedback(lqr(A, B, *_weights(weights)).K, reference)
+    return StateFeedback(
+        paper.regulator(given.get("design", "placement"), given.get("gains", "printed"), plant).K, reference
+    )
 
 
-def _build_gate(changes: dict[str, Any], plant: CartPole, reference: State) -> Gate:
+def _weights(given: Mapping[str, Any]) -> tuple[np.ndarray[Any, Any], list[list[float]]]:
+    return np.diag(given.get("Q", paper.Q)).astype(float), [[float(given.get("R", paper.R))]]
+
+
+def parse_poles(texts: Sequence[str]) -> list[complex]:
+    """Poles as a person writes them: -3, -5+2j, or with i for j.
+
+    Raises:
+      InputError: one that is no number.
+    """
+    poles = []
+    for text in texts:
+        try:
+            poles.append(complex(str(text).replace("i", "j").replace(" ", "")))
+        except ValueError as problem:
+            raise InputError("poles", text, "a number such as -3 or -5+2j") from problem
+    return poles
+
+
+def _build_gate(changes: dict[str, Any], plant: CartPole, reference: State, weights: Mapping[str, Any]) -> Gate:
     name = changes.pop("gate", "angle")
     cls = _GATES[name]
     for key in changes:
@@ -237,7 +278,7 @@ def _build_gate(changes: dict[str, Any], plant: CartPole, reference: State) -> G
         if key in rules(cls) and key not in changes:
             raise InputError(key, None, f"given: the gate {name} needs it")
     if cls is LyapunovGate:
-        return LyapunovGate(paper.riccati_solution(plant), reference=reference, **changes)
+        return LyapunovGate(lqr(*linearize(plant), *_weights(weights)).P, reference=reference, **changes)
     return cls(**{"half_angle": paper.SWITCH_ANGLE, **changes})
 
 

@@ -119,10 +119,12 @@ def _solved(
     concrete = not any(is_traced(x) for x in problem)
     if concrete:
         _check_weights(*(np.asarray(x, dtype=np.float64) for x in (Q, R, N)))
+        _check_modes(time, *(np.asarray(x, dtype=np.float64) for x in problem), room=32.0 * n * np.finfo(A.dtype).eps)
     P, K = equation(A, B, 0.5 * (Q + Q.T), 0.5 * (R + R.T), N)
     found = jnp.all(jnp.isfinite(P))
     if concrete and not found:
-        raise _reason(time, *(np.asarray(x, dtype=np.float64) for x in problem))
+        _check_modes(time, *(np.asarray(x, dtype=np.float64) for x in problem), room=np.sqrt(np.finfo(A.dtype).eps))
+        raise InputError("Q", Q, f"better conditioned with A, B and R: in {A.dtype}, rounding hides the solution")
     return RiccatiSolution(P, K, found)
 
 
@@ -207,9 +209,9 @@ def _cayley(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matr
     return E, symmetric(G), symmetric(H), scale
 
 
-def _double(E: Matrix, G: Matrix, H: Matrix, scale: jax.Array) -> _Start:
+def _double(E0: Matrix, G0: Matrix, H0: Matrix, scale: jax.Array) -> _Start:
     """Anderson's doubling: H grows to the solution and G to that of the dual equation, while E vanishes."""
-    eps = np.finfo(E.dtype).eps
+    eps = np.finfo(E0.dtype).eps
     Carry: TypeAlias = tuple[Matrix, Matrix, Matrix, jax.Array, jax.Array]
 
     def unfinished(carry: Carry) -> jax.Array:
@@ -227,11 +229,12 @@ def _double(E: Matrix, G: Matrix, H: Matrix, scale: jax.Array) -> _Start:
         change = jnp.maximum(_relative_size(more_G, G), _relative_size(more_H, H))
         return product(EV, E), G, H, ~(change > eps**0.5), count + 1
 
-    finished = jnp.zeros(E.shape[2:], dtype=bool)
-    E, G, H, _, _ = lax.while_loop(unfinished, double, (E, G, H, finished, jnp.zeros((), dtype=jnp.int32)))
-    # Where an unstable mode cannot be moved or is not seen, H or G grows to where rounding stops it. The trace of
-    # G H is the same in all coordinates of the state.
-    plausible = jnp.abs(jnp.sum(G * H, axis=(0, 1))) < 0.01 / eps
+    finished = jnp.zeros(E0.shape[2:], dtype=bool)
+    E, G, H, _, _ = lax.while_loop(unfinished, double, (E0, G0, H0, finished, jnp.zeros((), dtype=jnp.int32)))
+    # Where a mode that is not stable is not seen, G grows to where overflow or rounding stops it: it is then no
+    # solution of the dual equation. (Where one cannot be moved, H is none of this, and Newton's method finds none.)
+    again = G0 + product(E0, G, inverse(identity_like(E) + product(H0, G)), transpose(E0))
+    plausible = (largest(again - G) <= 0.4 * largest(G)) & (jnp.sum(G * H, axis=(0, 1)) < 0.01 / eps**2)
     return _Start(H * scale, plausible)
 
 
@@ -255,8 +258,10 @@ def _corrected(
 
     def unfinished(carry: Carry) -> jax.Array:
         _, size, previous, _, count = carry
-        # What the next correction would be is a small multiple of this one, or of its square.
-        return jnp.any((size > eps**0.75) & (size < 0.5 * previous)) & (count < _MOST_CORRECTIONS)
+        # What the next correction would be is a small multiple of this one, or of its square; but only near the
+        # solution, so the first three may be of any size.
+        ahead = (size < 0.5 * previous) | (count < 3)
+        return jnp.any((size > eps**0.75) & ahead) & (count < _MOST_CORRECTIONS)
 
     def correct(carry: Carry) -> Carry:
         P, previous, _, _, count = carry
@@ -345,29 +350,25 @@ def _check_weights(Q: _Numbers, R: _Numbers, N: _Numbers) -> None:
         raise InputError("Q", Q, "positive semidefinite")
 
 
-def _reason(time: str, A: _Numbers, B: _Numbers, Q: _Numbers, R: _Numbers, N: _Numbers) -> InputError:
+def _check_modes(time: str, A: _Numbers, B: _Numbers, Q: _Numbers, R: _Numbers, N: _Numbers, *, room: float) -> None:
+    """Refuses a mode that is not stable by itself and that, up to `room`, no input moves or no weight sees."""
     weight = np.linalg.inv(R)
-    free = A - B @ weight @ N.T
-    cost = Q - N @ weight @ N.T
-    for name, matrix, other, words in (
-        ("B", A, B, "stabilisable with A: it must move the mode with eigenvalue"),
-        ("Q", free.T, cost, "detectable with A: it must weigh the mode with eigenvalue"),
+    free, cost = A - B @ weight @ N.T, Q - N @ weight @ N.T
+    for name, value, matrix, other, words in (
+        ("B", B, A, B, "stabilisable with A: it must move the mode with eigenvalue"),
+        ("Q", Q, free.T, cost, "detectable with A: it must weigh the mode with eigenvalue"),
     ):
-        mode = _fixed_mode(time, matrix, other)
+        mode = _fixed_mode(time, matrix, other, room)
         if mode is not None:
-            return InputError(name, B if name == "B" else Q, f"{words} {mode:.6g}, which is not stable by itself")
-    return InputError("Q", Q, "better conditioned with A, B and R: no solution can be told from rounding in this dtype")
+            raise InputError(name, value, f"{words} {mode:.6g}, which is not stable by itself")
 
 
-def _fixed_mode(time: str, A: _Numbers, B: _Numbers) -> complex | None:
-    """An eigenvalue of A on or beyond the edge of stability that no input moves (Popov, Belevitch, Hautus)."""
+def _fixed_mode(time: str, A: _Numbers, B: _Numbers, room: float) -> complex | None:
+    """An eigenvalue of A at or beyond the edge of stability that no input moves (Popov, Belevitch and Hautus)."""
+    size, push = max(float(np.linalg.norm(A)), 1e-300), max(float(np.linalg.norm(B)), 1e-300)
     for mode in np.linalg.eigvals(A):
-        room = 1e-7 * max(1.0, float(np.linalg.norm(A)))
-        if (mode.real if time == "continuous" else abs(mode) - 1.0) < -room:
-            continue
-        pencil = np.hstack(
-            [(mode * np.eye(len(A)) - A) / max(np.linalg.norm(A), 1e-300), B / max(np.linalg.norm(B), 1e-300)]
-        )
-        if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-7:
+        beyond = mode.real / size if time == "continuous" else abs(mode) - 1.0
+        pencil = np.hstack([(mode * np.eye(len(A)) - A) / size, B / push])
+        if beyond > -room and np.linalg.svd(pencil, compute_uv=False)[-1] < room:
             return complex(mode) if mode.imag else float(mode.real)
     return None

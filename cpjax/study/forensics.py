@@ -228,8 +228,15 @@ def audit_gains(
         progress(total, total, "singular values")
     audit = GainAudit(_residuals_of(prints, plant), tuple(fits), (), plant)
     chosen = audit.simplest[0] if audit.simplest else min(fits, key=lambda fit: fit.worst)
-    found = _changed(plant, dict(zip(chosen.parameters, chosen.values, strict=True)))
+    found = changed(plant, dict(zip(chosen.parameters, chosen.values, strict=True)))
     return dataclasses.replace(audit, directions=_directions(tuple(prints), found, names), plant=found)
+
+
+def changed(plant: CartPole, changes: Mapping[str, Any]) -> CartPole:
+    """The plant with some of its or its motor's parameters changed."""
+    motor = {key: value for key, value in changes.items() if key in rules(Motor)}
+    own = {key: value for key, value in changes.items() if key not in motor}
+    return dataclasses.replace(plant, **own, motor=dataclasses.replace(plant.motor, **motor))
 
 
 def document(audit: GainAudit, prints: Sequence[PrintedGain], plant: CartPole, **setting: Any) -> dict[str, Any]:
@@ -298,13 +305,7 @@ def _scale(plant: CartPole, name: str) -> float:
         "rotor_inertia": float(plant.cart_mass) * (plant.motor.wheel_radius / plant.motor.gear_ratio) ** 2,
         "back_emf_constant": float(plant.motor.torque_constant),
     }
-    return _value(plant, name) or typical[name] or 1.0
-
-
-def _changed(plant: CartPole, changes: Mapping[str, Any]) -> CartPole:
-    motor = {key: value for key, value in changes.items() if key in rules(Motor)}
-    own = {key: value for key, value in changes.items() if key not in motor}
-    return dataclasses.replace(plant, **own, motor=dataclasses.replace(plant.motor, **motor))
+    return _value(plant, name) or float(typical[name]) or 1.0
 
 
 def _residuals(prints: Sequence[PrintedGain], plant: CartPole) -> jax.Array:
@@ -334,12 +335,12 @@ def _fit_all(
     own = jnp.asarray([_value(plant, name) for name in names])
 
     def residuals(chosen: jax.Array, x: jax.Array) -> jax.Array:
-        changed = own.at[chosen].set(values(chosen, x))
-        return _residuals(prints, _changed(plant, dict(zip(names, changed, strict=True))))
+        numbers = own.at[chosen].set(values(chosen, x))
+        return _residuals(prints, changed(plant, dict(zip(names, numbers, strict=True))))
 
     def one(chosen: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        x = _least_squares(lambda x: residuals(chosen, x), x)
-        return values(chosen, x), residuals(chosen, x)
+        end = _least_squares(lambda y: residuals(chosen, y), x)
+        return values(chosen, end), residuals(chosen, end)
 
     count, each, size = starts.shape
     lanes = jnp.repeat(jnp.asarray(sets), each, axis=0), jnp.asarray(starts).reshape(-1, size)
@@ -391,7 +392,7 @@ def _directions(prints: tuple[PrintedGain, ...], plant: CartPole, names: tuple[s
     own = jnp.asarray([_value(plant, name) for name in names])
 
     def residuals(x: jax.Array) -> jax.Array:
-        return _residuals(prints, _changed(plant, dict(zip(names, own + sizes * x, strict=True))))
+        return _residuals(prints, changed(plant, dict(zip(names, own + sizes * x, strict=True))))
 
     J = np.asarray(jax.jit(jax.jacfwd(residuals))(jnp.zeros_like(sizes)))
     _, values, vectors = np.linalg.svd(J, full_matrices=True)

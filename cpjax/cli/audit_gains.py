@@ -1,0 +1,102 @@
+"""`cpjax audit-gains`: which plant printed gains come from, as a table, a picture and JSON."""
+
+import argparse
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from cpjax.cli.options import PLANT_OPTIONS, Option, Sections, add_options, build_plant, parse_poles, resolve
+from cpjax.cli.progress import progress
+from cpjax.errors import InputError
+from cpjax.study.forensics import PARAMETERS, GainAudit, PrintedGain, audit_gains, printed_in_the_paper, write
+
+OPTIONS = [
+    *PLANT_OPTIONS,
+    Option("gains", "lqr_gain", "an LQR gain as printed; its digits say how precise it is", count=4),
+    Option("gains", "Q", "what it was designed for: diagonal of the state weight", float, count=4, flag="q"),
+    Option("gains", "R", "and the weight of the voltage", float, flag="r"),
+    Option("gains", "placement_gain", "a gain of pole placement as printed", count=4),
+    Option("gains", "poles", "what it places, such as -3 -4 -5+2j -5-2j", count=4),
+    Option("audit", "parameters", "those that may change, with commas between (default all of the plant's)"),
+    Option("audit", "most", "how many may change at once (default 2)", int),
+    Option("audit", "starts", "random starts for each set of them (default 128)", int),
+]
+
+
+def add_command(commands: Any) -> None:
+    """Declares the command."""
+    text = (
+        "Finds the changes of a plant that explain printed gains, and the combinations of parameters that the gains "
+        "fix at all. Without a gain, audits the paper's. Writes audit_gains.json and audit_gains.png."
+    )
+    parser = commands.add_parser("audit-gains", help="which plant printed gains come from", description=text)
+    add_options(parser, OPTIONS, out="out/audit-gains")
+    parser.set_defaults(run=run)
+
+
+def run(given: argparse.Namespace) -> int:
+    """Runs the command."""
+    sections = resolve(given, OPTIONS)
+    plant = build_plant(sections["plant"])
+    prints = _prints(sections["gains"])
+    setting = _setting(sections)
+    with progress("audit-gains") as report:
+        audit = audit_gains(prints, plant, **setting, seed=given.seed, progress=report)
+    path = given.out / "audit_gains.json"
+    write(path, audit, prints, plant, seed=given.seed, **setting)
+
+    from cpjax.show.figures import save_figure
+    from cpjax.show.forensics import findings, picture
+
+    save_figure(given.out / "audit_gains.png", picture(audit))
+    print_audit(audit, plant)
+    print(*findings(audit), sep="\n")
+    print(f"wrote {path} and {given.out / 'audit_gains.png'}")
+    return 0
+
+
+def print_audit(audit: GainAudit, plant: Any) -> None:
+    """The tables for people."""
+    from cpjax.show.forensics import DIRECTION_HEADER, FIT_HEADER, direction_cells, fit_cells, shown_fits
+
+    _print_table(
+        "Residuals in units of the last printed digit", FIT_HEADER, [fit_cells(f, plant) for f in shown_fits(audit)]
+    )
+    rows = [direction_cells(d) for d in audit.directions if d.sensitivity > 0.0]
+    _print_table("Combinations that the gains know, at the best of these plants", DIRECTION_HEADER, rows)
+
+
+def _print_table(title: str, header: tuple[str, ...], rows: list[list[str]]) -> None:
+    table = Table(title=title, title_justify="left")
+    for i, name in enumerate(header):
+        table.add_column(name, justify="left" if i < len(header) - len(header) // 2 - 1 else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    console = Console()
+    Console(width=160).print(table) if not console.is_terminal else console.print(table)
+
+
+def _setting(sections: Sections) -> dict[str, Any]:
+    given = dict(sections["audit"])
+    names = given.pop("parameters", None)
+    chosen = PARAMETERS if names is None else tuple(name.strip() for name in names.split(","))
+    return {"parameters": chosen, "most": min(2, len(chosen)), "starts": 128, **given}
+
+
+def _prints(given: Mapping[str, Any]) -> list[PrintedGain]:
+    prints = []
+    if "placement_gain" in given:
+        if "poles" not in given:
+            raise InputError("poles", None, "given: a placement gain is designed for poles")
+        prints.append(PrintedGain.placement(given["placement_gain"], parse_poles(given["poles"])))
+    if "lqr_gain" in given:
+        for key in ("Q", "R"):
+            if key not in given:
+                raise InputError(key, None, "given: an lqr gain is designed for weights")
+        prints.append(PrintedGain.lqr(given["lqr_gain"], given["Q"], given["R"]))
+    for key, gain in (("poles", "placement_gain"), ("Q", "lqr_gain"), ("R", "lqr_gain")):
+        if key in given and gain not in given:
+            raise InputError(key, given[key], f"absent where {gain} is")
+    return prints or printed_in_the_paper()
