@@ -4,11 +4,9 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 from cpjax.cli.options import PLANT_OPTIONS, Option, Sections, add_options, build_plant, parse_poles, resolve
 from cpjax.cli.progress import progress
+from cpjax.cli.tables import print_table
 from cpjax.errors import InputError
 from cpjax.study.forensics import PARAMETERS, GainAudit, PrintedGain, audit_gains, printed_in_the_paper, write
 
@@ -61,21 +59,11 @@ def print_audit(audit: GainAudit, plant: Any) -> None:
     """The tables for people."""
     from cpjax.show.forensics import DIRECTION_HEADER, FIT_HEADER, direction_cells, fit_cells, shown_fits
 
-    _print_table(
-        "Residuals in units of the last printed digit", FIT_HEADER, [fit_cells(f, plant) for f in shown_fits(audit)]
-    )
-    rows = [direction_cells(d) for d in audit.directions if d.sensitivity > 0.0]
-    _print_table("Combinations that the gains know, at the best of these plants", DIRECTION_HEADER, rows)
-
-
-def _print_table(title: str, header: tuple[str, ...], rows: list[list[str]]) -> None:
-    table = Table(title=title, title_justify="left")
-    for i, name in enumerate(header):
-        table.add_column(name, justify="left" if i < len(header) - len(header) // 2 - 1 else "right", overflow="fold")
-    for row in rows:
-        table.add_row(*row)
-    console = Console()
-    Console(width=160).print(table) if not console.is_terminal else console.print(table)
+    title = "Residuals in units of the last printed digit"
+    print_table(title, FIT_HEADER, [fit_cells(fit, plant) for fit in shown_fits(audit)], text_columns=2)
+    title = "Combinations that the gains know, at the best of these plants"
+    known = [direction_cells(d) for d in audit.directions if d.sensitivity > 0.0]
+    print_table(title, DIRECTION_HEADER, known, text_columns=1)
 
 
 def _setting(sections: Sections) -> dict[str, Any]:

@@ -4,11 +4,9 @@ import argparse
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 from cpjax.cli.options import EVALUATION_OPTIONS, add_options, resolve
 from cpjax.cli.progress import progress
+from cpjax.cli.tables import print_table
 from cpjax.study.reproduction import Setting, reproduce
 
 
@@ -57,11 +55,5 @@ def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
     """The table for people."""
     from cpjax.show.reproduction import HEADER, cells
 
-    table = Table(title="Settling, travel, effort and variation over successes; peak over all runs")
-    for i, name in enumerate(HEADER):
-        table.add_column(name, justify="left" if i < 4 else "right", overflow="fold")
-    for row in rows:
-        table.add_row(*cells(row))
-    console = Console()
-    # Where the width is not known (a file, a pipe) lines are as long as they need to be.
-    Console(width=200).print(table) if not console.is_terminal else console.print(table)
+    title = "Settling, travel, effort and variation over successes; peak over all runs"
+    print_table(title, HEADER, map(cells, rows), text_columns=4)

@@ -110,7 +110,7 @@ def controllability_gramian(A: Any, B: Any, horizon: Scalar | None = None) -> ja
 
     A finite horizon needs no stability. Van Loan's block exponential (1978) covers a piece of it that is short against
     A's norm, and doubling the rest, W(2t) = W(t) + e^(A t) W(t) e^(A' t): a sum without cancellation. The relative
-    error grows with the horizon as that of e^(A horizon) does, by about eps per unit of norm(A) * horizon; where
+    error grows with the horizon as that of e^(A horizon) does, a few eps per unit of norm(A) * horizon; where
     e^(A horizon) overflows, so does W. (The block exponential alone loses digits with e^(norm(A) * horizon).)
 
     Args:

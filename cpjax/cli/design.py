@@ -1,0 +1,48 @@
+"""`cpjax design`: a regulator on a plant, checked, as a table, a picture and JSON."""
+
+import argparse
+from typing import Any
+
+from cpjax import io
+from cpjax.cli.options import CONTROLLER_OPTIONS, PLANT_OPTIONS, add_options, build_controller, build_plant, resolve
+from cpjax.cli.tables import print_table
+from cpjax.controllers import Hybrid
+from cpjax.errors import InputError
+from cpjax.study.design_check import check_design, document
+
+OPTIONS = [*PLANT_OPTIONS, *CONTROLLER_OPTIONS]
+
+
+def add_command(commands: Any) -> None:
+    """Declares the command."""
+    text = (
+        "Computes or takes a regulator's gain and checks it on the plant's linear model: poles, margins, the voltage "
+        "that it asks for, and the region in which it needs neither clip nor gate. Writes design.json and design.png."
+    )
+    parser = commands.add_parser("design", help="a regulator's gain and what it is worth", description=text)
+    add_options(parser, OPTIONS, out="out/design")
+    parser.set_defaults(run=run)
+
+
+def run(given: argparse.Namespace) -> int:
+    """Runs the command."""
+    sections = resolve(given, OPTIONS)
+    plant = build_plant(sections["plant"])
+    controller = build_controller(sections["controller"], plant)
+    if not isinstance(controller, Hybrid):
+        raise InputError("controller", type(controller).__name__, "a Hybrid: a regulator behind a gate")
+    regulator: Any = controller.regulator
+    check = check_design(plant, regulator, controller.gate)
+    path = given.out / "design.json"
+    setting = {"seed": given.seed, "plant": io.encode(plant), "controller": io.encode(controller)}
+    io.write_json(path, document(check, **setting))
+
+    from cpjax.show.design import picture, rows
+    from cpjax.show.figures import save_figure
+
+    limit = float(plant.motor.voltage_limit)
+    title = "u = -K s with K = " + ", ".join(f"{k:.5g}" for k in check.K[0])
+    save_figure(given.out / "design.png", picture(check, controller.gate, limit, title))
+    print_table(title, ("check", "value", "unit"), rows(check, limit), text_columns=3)
+    print(f"wrote {path} and {given.out / 'design.png'}")
+    return 0

@@ -1,0 +1,18 @@
+"""Tables for people, on standard output."""
+
+from collections.abc import Iterable, Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+
+def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int) -> None:
+    """A table whose first `text_columns` columns are words and whose others are numbers."""
+    table = Table(title=title, title_justify="left")
+    for i, name in enumerate(header):
+        table.add_column(name, justify="left" if i < text_columns else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    console = Console()
+    # Where the width is not known (a file, a pipe) lines are as long as they need to be.
+    Console(width=200).print(table) if not console.is_terminal else console.print(table)

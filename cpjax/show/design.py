@@ -1,0 +1,87 @@
+"""The checks of a linear design as a table and a picture."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cpjax.controllers import SWING_UP
+from cpjax.controllers.gates import Gate
+from cpjax.design.structure import Structure
+from cpjax.state import NAMES, UNITS, State
+from cpjax.study.design_check import DesignCheck
+
+_INK, _CLIP, _GATE = "#0072B2", "#D55E00", "#009E73"
+
+
+def rows(check: DesignCheck, voltage_limit: float) -> list[tuple[str, str, str]]:
+    """What was checked, the figure and its unit."""
+    m = check.margins
+    numbers = [
+        ("gain K", " ".join(f"{k:.6g}" for k in check.K[0]), "V per unit"),
+        ("closed-loop poles", "  ".join(_complex(p) for p in check.poles), "1/s"),
+        ("controllability", _structure(check.controllability), ""),
+        ("observability from x and theta", _structure(check.observability), ""),
+        ("gain may fall to", f"{float(m.gain_lower):.3g}", "times"),
+        ("gain may rise to", f"{float(m.gain_upper):.3g}", "times"),
+        ("phase margin", f"{math.degrees(float(m.phase)):.3g}", "deg"),
+        ("delay margin", f"{1000 * float(m.delay):.3g}", "ms"),
+        ("disk margin", f"{float(m.disk):.3g}", "of 2"),
+        (f"voltage at the gate, {math.degrees(check.gate_angle):.3g} deg", f"{check.gate_voltage:.4g}", "V"),
+        (f"asks for more than {voltage_limit:g} V beyond", f"{math.degrees(check.saturation_angle):.3g}", "deg"),
+    ]
+    if check.extent is not None:
+        reach = ", ".join(f"{e:.3g} {u}" for e, u in zip(check.extent, UNITS, strict=True))
+        numbers.append((f"certified level set, ended by the {check.limited_by}", reach, "largest " + ", ".join(NAMES)))
+    else:
+        numbers.append(("certified level set", "none", "the linear loop is not stable"))
+    return numbers
+
+
+def picture(check: DesignCheck, gate: Gate, voltage_limit: float, title: str) -> Figure:
+    """Poles, and what gate and clip leave of the plane of angle and rate."""
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.axvline(0, color="#999999", linewidth=0.8)
+    left.axhline(0, color="#999999", linewidth=0.8)
+    left.plot(check.poles.real, check.poles.imag, "x", color=_INK, markersize=9, markeredgewidth=2)
+    left.set_xlabel("real part [1/s]")
+    left.set_ylabel("imaginary part [rad/s]")
+    left.set_title("closed-loop poles", loc="left")
+    left.margins(0.15)
+    _plane(right, check, gate, voltage_limit)
+    figure.suptitle(title)
+    return figure
+
+
+def _plane(axes: Axes, check: DesignCheck, gate: Gate, voltage_limit: float) -> None:
+    K, widest = check.K[0], min(1.3 * check.gate_angle, math.pi)
+    tallest = max(1.3 * voltage_limit / abs(K[3]) if K[3] else 0.0, 3.0 * widest)
+    theta, rate = np.meshgrid(np.linspace(-widest, widest, 301), np.linspace(-tallest, tallest, 301))
+    zero = np.zeros_like(theta)
+    margin = np.asarray(gate.margin(State(zero, zero, theta, rate), jnp.full(theta.shape, SWING_UP)))
+    degrees = np.degrees(theta)
+    axes.contour(degrees, rate, margin, levels=[0.0], colors=_GATE)
+    demand = np.abs(K[2] * theta + K[3] * rate)
+    axes.contourf(degrees, rate, demand, levels=[0.0, voltage_limit], colors=[_CLIP], alpha=0.25)
+    if check.P is not None and check.level is not None:
+        block = check.P[2:, 2:]
+        form = block[0, 0] * theta**2 + 2 * block[0, 1] * theta * rate + block[1, 1] * rate**2
+        axes.contourf(degrees, rate, form, levels=[0.0, check.level], colors=[_INK], alpha=0.7)
+    axes.plot([], [], color=_GATE, label="gate")
+    axes.fill_between([], [], color=_CLIP, alpha=0.25, label=f"asks for at most {voltage_limit:g} V")
+    axes.fill_between([], [], color=_INK, alpha=0.7, label="certified level set")
+    axes.set_xlabel(r"$\theta$ [deg]")
+    axes.set_ylabel(r"$\dot\theta$ [rad/s]")
+    axes.set_title("at x = 0, at rest", loc="left")
+    axes.legend(loc="upper right", fontsize=8)
+
+
+def _complex(pole: complex) -> str:
+    return f"{pole.real:.4g}" if pole.imag == 0 else f"{pole.real:.4g}{pole.imag:+.3g}i"
+
+
+def _structure(found: Structure) -> str:
+    return f"rank {int(found.rank)}, condition {float(found.condition):.3g}"

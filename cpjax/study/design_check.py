@@ -1,0 +1,136 @@
+"""What a linear regulator is worth on a plant with a voltage limit: poles, margins, saturation, a certified region."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from cpjax import io
+from cpjax.controllers import AngleGate, AngleRateGate, LyapunovGate, StateFeedback
+from cpjax.controllers.gates import Gate
+from cpjax.design.limits import (
+    demanded_voltage,
+    level_within_angle,
+    level_within_angle_and_rate,
+    level_within_form,
+    level_within_voltage,
+    lyapunov_function,
+    saturation_angle,
+)
+from cpjax.design.margins import Margins, closed_loop_poles, margins
+from cpjax.design.structure import POSITION_AND_ANGLE, Structure, controllability, observability
+from cpjax.errors import InputError
+from cpjax.plant import CartPole, linearize
+from cpjax.state import NAMES
+
+
+@dataclasses.dataclass(frozen=True)
+class DesignCheck:
+    """What `check_design` found. The level and its extent are None where the linear loop is not stable.
+
+    Attributes:
+      K: the gain (1, 4).
+      poles: of the linear closed loop (4,) [1/s].
+      margins: of the loop broken at the voltage.
+      controllability: of the linear model from the voltage.
+      observability: of the linear model from x and theta.
+      gate_angle: the angle at which the gate opens at rest, cart in place [rad].
+      gate_voltage: what the gain asks for there [V].
+      saturation_angle: the angle beyond which it asks for more than there is [rad].
+      P: Lyapunov function s' P s of the linear closed loop, falling with s' s (4, 4).
+      level: the largest s' P s that stays inside clip and gate.
+      limited_by: which of the two ends it, "voltage" or "gate".
+      extent: how far each coordinate reaches inside that level set, in the order of the state.
+    """
+
+    K: np.ndarray[Any, Any]
+    poles: np.ndarray[Any, Any]
+    margins: Margins
+    controllability: Structure
+    observability: Structure
+    gate_angle: float
+    gate_voltage: float
+    saturation_angle: float
+    P: np.ndarray[Any, Any] | None
+    level: float | None
+    limited_by: str | None
+    extent: tuple[float, ...] | None
+
+
+def check_design(plant: CartPole, regulator: StateFeedback, gate: Gate) -> DesignCheck:
+    """The checks of a regulator behind a gate, on the plant's linear model about upright.
+
+    Raises:
+      InputError: a regulator that is no StateFeedback, a gate that is not one of the library's, or one of the two
+        about another state than upright at rest.
+    """
+    if not isinstance(regulator, StateFeedback):
+        raise InputError("regulator", regulator, "a cpjax.StateFeedback")
+    if not isinstance(gate, (AngleGate, AngleRateGate, LyapunovGate)):
+        raise InputError("gate", gate, "an AngleGate, AngleRateGate or LyapunovGate")
+    for name, part in (("regulator", regulator), ("gate", gate)):
+        reference = getattr(part, "reference", None)
+        if reference is not None and any(float(getattr(reference, n)) for n in NAMES if n != "x"):
+            raise InputError(f"{name}.reference", reference, "upright at rest, wherever the cart is")
+    A, B = linearize(plant)
+    K = jnp.asarray(regulator.K, dtype=A.dtype)
+    limit = plant.motor.voltage_limit
+    found = margins(A, B, K)
+    angle = _opening_angle(gate)
+    P = level = limited_by = extent = None
+    if bool(found.stable):
+        P = lyapunov_function(A, B, K, jnp.eye(4, dtype=A.dtype))
+        inside_clip, inside_gate = float(level_within_voltage(P, K, limit)), float(_level_within(gate, P))
+        level = min(inside_clip, inside_gate)
+        limited_by = "voltage" if inside_clip < inside_gate else "gate"
+        extent = tuple(float(e) for e in np.sqrt(level * np.diag(np.linalg.inv(np.asarray(P)))))
+    return DesignCheck(
+        K=np.asarray(K),
+        poles=np.asarray(closed_loop_poles(A, B, K)),
+        margins=found,
+        controllability=controllability(A, B),
+        observability=observability(A, jnp.asarray(POSITION_AND_ANGLE, dtype=A.dtype)),
+        gate_angle=angle,
+        gate_voltage=float(demanded_voltage(K, angle)),
+        saturation_angle=float(saturation_angle(K, limit)),
+        P=None if P is None else np.asarray(P),
+        level=level,
+        limited_by=limited_by,
+        extent=extent,
+    )
+
+
+def document(check: DesignCheck, **setting: Any) -> dict[str, Any]:
+    """The check as plain values, for JSON."""
+    return {
+        "what": "a linear regulator on the plant's linear model about upright, behind a gate and a voltage limit",
+        "versions": io.versions(),
+        **setting,
+        "K": check.K,
+        "poles": [[p.real, p.imag] for p in check.poles],
+        "margins": check.margins._asdict(),
+        "controllability": {"rank": check.controllability.rank, "condition": check.controllability.condition},
+        "observability": {"rank": check.observability.rank, "condition": check.observability.condition},
+        **{
+            name: getattr(check, name)
+            for name in ("gate_angle", "gate_voltage", "saturation_angle", "P", "level", "limited_by", "extent")
+        },
+    }
+
+
+def _opening_angle(gate: Gate) -> float:
+    if isinstance(gate, LyapunovGate):
+        return math.sqrt(float(gate.level) / float(np.asarray(gate.P)[2, 2]))
+    assert isinstance(gate, (AngleGate, AngleRateGate))
+    return float(gate.half_angle)
+
+
+def _level_within(gate: Gate, P: Any) -> Any:
+    if isinstance(gate, LyapunovGate):
+        return level_within_form(P, jnp.asarray(gate.P, dtype=P.dtype), gate.level)
+    if isinstance(gate, AngleRateGate):
+        return level_within_angle_and_rate(P, gate.half_angle, gate.rate)
+    assert isinstance(gate, AngleGate)
+    return level_within_angle(P, gate.half_angle)
