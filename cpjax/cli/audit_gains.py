@@ -19,7 +19,7 @@ OPTIONS = [
     Option("gains", "poles", "what it places, such as -3 -4 -5+2j -5-2j", count=4),
     Option("audit", "parameters", "those that may change, with commas between (default all of the plant's)"),
     Option("audit", "most", "how many may change at once (default 2)", int),
-    Option("audit", "starts", "random starts for each set of them (default 128)", int),
+    Option("audit", "starts", "random starts for each set of them (default 32)", int),
 ]
 
 
@@ -70,7 +70,7 @@ def _setting(sections: Sections) -> dict[str, Any]:
     given = dict(sections["audit"])
     names = given.pop("parameters", None)
     chosen = PARAMETERS if names is None else tuple(name.strip() for name in names.split(","))
-    return {"parameters": chosen, "most": min(2, len(chosen)), "starts": 128, **given}
+    return {"parameters": chosen, "most": min(2, len(chosen)), "starts": 32, **given}
 
 
 def _prints(given: Mapping[str, Any]) -> list[PrintedGain]:

@@ -10,10 +10,40 @@ from matplotlib.figure import Figure
 from cpjax.controllers import SWING_UP
 from cpjax.controllers.gates import Gate
 from cpjax.design.structure import Structure
+from cpjax.show.figures import DESIGN_NAMES
 from cpjax.state import NAMES, UNITS, State
 from cpjax.study.design_check import DesignCheck
 
 _INK, _CLIP, _GATE = "#0072B2", "#D55E00", "#009E73"
+
+COMPARISON = (
+    "regulator",
+    "gains",
+    "poles [1/s]",
+    "gain may fall to",
+    "phase margin [deg]",
+    "delay margin [ms]",
+    "voltage at the switch [V]",
+    "saturates beyond [deg]",
+    "certified up to [deg]",
+)
+"""Columns of `compared`."""
+
+
+def compared(design: str, gains: str, check: DesignCheck) -> list[str]:
+    """One design as a line of a table."""
+    m = check.margins
+    return [
+        DESIGN_NAMES[design],
+        gains,
+        ", ".join(_complex(p) for p in check.poles),
+        f"{float(m.gain_lower):.2g}",
+        f"{math.degrees(float(m.phase)):.0f}",
+        f"{1000 * float(m.delay):.3g}",
+        f"{check.gate_voltage:.0f}",
+        f"{math.degrees(check.saturation_angle):.2f}",
+        "-" if check.extent is None else f"{math.degrees(check.extent[2]):.2f}",
+    ]
 
 
 def rows(check: DesignCheck, voltage_limit: float) -> list[tuple[str, str, str]]:
@@ -75,7 +105,7 @@ def _plane(axes: Axes, check: DesignCheck, gate: Gate, voltage_limit: float) -> 
     axes.fill_between([], [], color=_INK, alpha=0.7, label="certified level set")
     axes.set_xlabel(r"$\theta$ [deg]")
     axes.set_ylabel(r"$\dot\theta$ [rad/s]")
-    axes.set_title("at x = 0, at rest", loc="left")
+    axes.set_title("cart at rest in the middle", loc="left")
     axes.legend(loc="upper right", fontsize=8)
 
 

@@ -23,6 +23,7 @@ from cpjax import io, paper
 from cpjax.design.lqr import lqr
 from cpjax.design.placement import place_polynomial, polynomial_from_poles
 from cpjax.errors import InputError
+from cpjax.numeric.small_matrices import linear_solve
 from cpjax.plant import CartPole, Motor, linearize
 from cpjax.pytree import Number, rules
 
@@ -38,6 +39,7 @@ EXPLAINED = 1.0
 """Worst residual, in units of the last digit, up to which gains count as explained: rounding twice is 1.0."""
 
 _STEPS = 40
+_LANES = 512
 _START_FACTOR = 3.0
 Progress: TypeAlias = Callable[[int, int, str], None]
 
@@ -187,7 +189,7 @@ def audit_gains(
     *,
     parameters: Sequence[str] = PARAMETERS,
     most: int = 2,
-    starts: int = 128,
+    starts: int = 32,
     seed: int = 1,
     progress: Progress | None = None,
 ) -> GainAudit:
@@ -219,13 +221,16 @@ def audit_gains(
     total = sum(math.comb(len(names), size) for size in range(1, most + 1))
     for size in range(1, most + 1):
         sets = list(itertools.combinations(range(len(names)), size))
-        if progress is not None:
-            progress(len(fits), total, f"{len(sets)} sets of {size}, {starts} starts each")
+        words = f"{len(sets)} sets of {size}, {starts} starts each"
+
+        def report(done: int, before: int = len(fits), words: str = words) -> None:
+            if progress is not None:
+                progress(before + done, total, words)
+
+        report(0)
         spread = math.log(_START_FACTOR)
         x = generator.uniform(-spread, spread, (len(sets), starts, size))
-        fits += _fit_all(tuple(prints), plant, names, base, sets, x)
-    if progress is not None:
-        progress(total, total, "singular values")
+        fits += _fit_all(tuple(prints), plant, names, base, sets, x, report)
     audit = GainAudit(_residuals_of(prints, plant), tuple(fits), (), plant)
     chosen = audit.simplest[0] if audit.simplest else min(fits, key=lambda fit: fit.worst)
     found = changed(plant, dict(zip(chosen.parameters, chosen.values, strict=True)))
@@ -325,6 +330,7 @@ def _fit_all(
     base: np.ndarray[Any, Any],
     sets: Sequence[tuple[int, ...]],
     starts: np.ndarray[Any, Any],
+    done: Callable[[int], None],
 ) -> list[Fit]:
     """The best of all starts for each set of parameters; `starts` (sets, starts, size) are logarithms of factors."""
 
@@ -343,8 +349,16 @@ def _fit_all(
         return values(chosen, end), residuals(chosen, end)
 
     count, each, size = starts.shape
-    lanes = jnp.repeat(jnp.asarray(sets), each, axis=0), jnp.asarray(starts).reshape(-1, size)
-    found, rest = (np.asarray(a).reshape(count, each, -1) for a in jax.jit(jax.vmap(one))(*lanes))
+    at_once = max(1, min(count, _LANES // each))
+    run = jax.jit(jax.vmap(one))
+    parts = []
+    for first in range(0, count, at_once):
+        # The last part repeats a set where it is short: one shape, compiled once.
+        rows = np.minimum(np.arange(first, first + at_once), count - 1)
+        lanes = np.repeat(np.asarray(sets)[rows], each, axis=0), starts[rows].reshape(-1, size)
+        parts.append([np.asarray(a).reshape(at_once, each, -1) for a in run(*map(jnp.asarray, lanes))])
+        done(min(first + at_once, count))
+    found, rest = (np.concatenate(part)[:count] for part in zip(*parts, strict=True))
     cost = np.where(np.isfinite(rest).all(axis=-1), np.sum(rest**2, axis=-1), np.inf)
     fits = []
     for row, chosen in enumerate(sets):
@@ -365,24 +379,21 @@ def _fit_all(
 def _least_squares(residuals: Callable[[jax.Array], jax.Array], x: jax.Array) -> jax.Array:
     """Minimises the residuals' sum of squares by Levenberg and Marquardt's method, from x (n,)."""
 
-    def cost(x: jax.Array) -> jax.Array:
-        r = residuals(x)
-        return jnp.sum(r * r)
+    def evaluated(x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        J, r = jax.jacfwd(lambda y: (residuals(y),) * 2, has_aux=True)(x)
+        return x, r, J
 
-    def step(carry: tuple[jax.Array, jax.Array, jax.Array], _: None) -> tuple[Any, None]:
-        x, now, damping = carry
-        r = residuals(x)
-        J = jax.jacfwd(residuals)(x)
+    def step(carry: tuple[Any, jax.Array], _: None) -> tuple[Any, None]:
+        (x, r, J), damping = carry
         H = J.T @ J
         damped = H + damping * jnp.diag(jnp.diagonal(H) + np.finfo(x.dtype).tiny)
         # A relative change by more than e in one step leaves the region where a derivative means something.
-        trial = x - jnp.clip(jnp.linalg.solve(damped, J.T @ r), -1.0, 1.0)
-        then = cost(trial)
-        better = then < now  # False for NaN
-        kept = jnp.where(better, trial, x), jnp.where(better, then, now)
-        return (*kept, jnp.clip(jnp.where(better, damping / 5.0, damping * 4.0), 1e-12, 1e8)), None
+        trial = evaluated(x - jnp.clip(linear_solve(damped, (J.T @ r)[:, None])[:, 0], -1.0, 1.0))
+        better = jnp.sum(trial[1] ** 2) < jnp.sum(r * r)  # False for NaN
+        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), trial, (x, r, J))
+        return (kept, jnp.clip(jnp.where(better, damping / 5.0, damping * 4.0), 1e-12, 1e8)), None
 
-    (x, _, _), _ = lax.scan(step, (x, cost(x), jnp.asarray(1e-2, dtype=x.dtype)), length=_STEPS)
+    ((x, _, _), _), _ = lax.scan(step, (evaluated(x), jnp.asarray(1e-2, dtype=x.dtype)), length=_STEPS)
     return x
 
 

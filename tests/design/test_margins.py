@@ -143,7 +143,7 @@ def test_the_disk_margins_are_python_controls(plant, design):
     assert found["disk_phase"] == pytest.approx(math.radians(phase), rel=1e-10)
 
 
-@pytest.mark.parametrize("n", [2, 3, 4, 6])
+@pytest.mark.parametrize("n", [2, 4, 6])
 def test_no_margin_of_a_random_loop_is_missed_that_a_dense_grid_finds(n):
     for loop in random_loops(n, 25, seed=1):
         found = numbers(margins(*loop))
@@ -352,7 +352,8 @@ def test_of_an_unstable_loop_all_margins_are_nan_with_finite_derivatives():
     found = margins(A, B, -K)
     assert not found.stable
     assert all(math.isnan(value) for value in found[1:])
-    assert all(np.all(part == 0.0) for part in reverse(tuple(map(jnp.asarray, (A, B, -K)))))
+    jacobian, _ = reverse(tuple(map(jnp.asarray, (A, B, -K))))
+    assert all(np.all(part == 0.0) for part in jacobian)
 
 
 @the_papers_loops
@@ -398,7 +399,13 @@ def forward(loop, direction):
 
 @jax.jit
 def reverse(loop):
-    return jax.jacrev(lambda loop: vector(margins(*loop)))(loop)
+    """Jacobians in A, B and K, and the margins."""
+
+    def twice(loop):
+        values = vector(margins(*loop))
+        return values, values
+
+    return jax.jacrev(twice, has_aux=True)(loop)
 
 
 def directions(loop, count=3):
@@ -421,9 +428,8 @@ def richardson(function, h):
 @every_loop
 def test_every_finite_margins_derivative_agrees_forward_in_reverse_and_with_differences(loop):
     loop = tuple(map(jnp.asarray, loop))
-    values = vector(margins(*loop))
+    jacobian, values = reverse(loop)
     finite = np.isfinite(values)
-    jacobian = reverse(loop)
     assert all(np.all(np.isfinite(part)) for part in jacobian)
     for direction in directions(loop):
         ahead = forward(loop, direction)
@@ -450,13 +456,14 @@ def test_every_finite_margins_derivative_agrees_forward_in_reverse_and_with_diff
     ids=["equal poles", "plant on the axis", "no gain", "no input", "four equal poles"],
 )
 def test_no_derivative_is_nan_where_a_loop_is_degenerate(loop):
-    assert all(np.all(np.isfinite(part)) for part in reverse(tuple(map(jnp.asarray, loop))))
+    jacobian, _ = reverse(tuple(map(jnp.asarray, loop)))
+    assert all(np.all(np.isfinite(part)) for part in jacobian)
 
 
 def test_the_margins_of_an_unstable_lag_have_their_textbook_derivatives_in_the_gain():
     """L = k / (s - 1) at k = 2, where the lower gain margin and the disk margin are met at frequency 0."""
-    A, B = jnp.ones((1, 1)), jnp.ones(1)
-    slopes = Margins(0.0, *jax.jacfwd(lambda k: vector(margins(A, B, k)))(jnp.asarray([2.0]))[:, 0])
+    (_, _, in_K), _ = reverse((jnp.diag(jnp.asarray([1.0, -1.0])), jnp.asarray([1.0, 0.0]), jnp.asarray([2.0, 0.0])))
+    slopes = Margins(0.0, *in_K[:, 0])
     assert slopes.gain_lower == pytest.approx(-1 / 4)  # of 1 / k
     assert slopes.phase == pytest.approx(1 / math.sqrt(12))  # of acos(1 / k)
     assert slopes.phase_frequency == pytest.approx(2 / math.sqrt(3))  # of sqrt(k^2 - 1)
@@ -480,12 +487,12 @@ def test_second_derivatives_are_those_of_the_first():
 def test_margins_and_their_derivatives_are_the_same_under_vmap():
     loops = [*LOOPS.values(), (LOOPS["placement"][0], LOOPS["placement"][1], -LOOPS["placement"][2])]
     batch = tuple(jnp.stack([jnp.asarray(m) for m in matrices]) for matrices in zip(*loops, strict=True))
-    together, jacobians = jax.vmap(lambda *loop: vector(margins(*loop)))(*batch), jax.vmap(reverse)(batch)
+    jacobians, values = jax.vmap(reverse)(batch)
     for i, loop in enumerate(loops):
-        loop = tuple(map(jnp.asarray, loop))
-        np.testing.assert_allclose(together[i], vector(margins(*loop)), rtol=1e-10)
-        for found, alone in zip(jacobians, reverse(loop), strict=True):
-            np.testing.assert_allclose(found[i], alone, rtol=1e-7, atol=1e-9)
+        jacobian, alone = reverse(tuple(map(jnp.asarray, loop)))
+        np.testing.assert_allclose(values[i], alone, rtol=1e-11)
+        for found, right in zip(jacobians, jacobian, strict=True):
+            np.testing.assert_allclose(found[i], right, rtol=1e-9, atol=1e-9)
 
 
 def test_the_closed_loop_poles_are_sorted_and_python_controls():
@@ -504,6 +511,7 @@ def test_the_closed_loop_poles_are_sorted_and_python_controls():
 def test_the_derivative_of_simple_poles_agrees_forward_in_reverse_and_with_differences():
     A, B, K = map(jnp.asarray, papers_loop("appendix", "placement"))
 
+    @jax.jit
     def poles(K):
         found = closed_loop_poles(A, B, K)
         return jnp.concatenate([found.real, found.imag])
