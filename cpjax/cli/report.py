@@ -17,10 +17,8 @@ if TYPE_CHECKING:  # matplotlib takes a while; bad input should not wait for it
 
 def add_command(commands: Any) -> None:
     """Declares the command."""
-    text = "Runs the reproduction and the audit of the paper and writes report.html, with the JSON and the pictures beside it."
-    parser = commands.add_parser(
-        "report", help="reproduction and audit of the paper as one HTML page", description=text
-    )
+    text = "Runs the reproduction and the audit of the paper; writes report.html, JSON and pictures beside it."
+    parser = commands.add_parser("report", help="the paper, run and audited, as one HTML page", description=text)
     add_options(parser, EVALUATION_OPTIONS, out="out/report")
     parser.set_defaults(run=run)
 
@@ -90,8 +88,8 @@ def _designs(page: "Page", given: argparse.Namespace) -> None:
     page.section("The two regulators as linear designs")
     page.text(
         "On the appendix's plant, linearised about upright, with the loop broken at the motor's voltage. Inside the "
-        "certified level set the linear loop needs neither the 12 V clip nor the switch at 30 degrees; its widest angle "
-        "is given."
+        "certified level set the linear loop needs neither the 12 V clip nor the switch at 30 degrees; the last column "
+        "has its widest angle."
     )
     page.table(COMPARISON, [compared(*key, check) for key, check in checks.items()], text_columns=2)
     page.note("Every number stands in `designs.json`; `cpjax design` checks any other regulator.")

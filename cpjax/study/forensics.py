@@ -8,8 +8,10 @@ leaves at most 0.5.
 """
 
 import dataclasses
+import functools
 import itertools
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -25,7 +27,7 @@ from cpjax.design.placement import place_polynomial, polynomial_from_poles
 from cpjax.errors import InputError
 from cpjax.numeric.small_matrices import linear_solve
 from cpjax.plant import CartPole, Motor, linearize
-from cpjax.pytree import Number, rules
+from cpjax.pytree import Number, cast, check, rules
 
 PARAMETERS = tuple(
     name
@@ -39,11 +41,13 @@ EXPLAINED = 1.0
 """Worst residual, in units of the last digit, up to which gains count as explained: rounding twice is 1.0."""
 
 _STEPS = 40
-_LANES = 512
+_LANES = 512  # fits that run side by side
 _START_FACTOR = 3.0
+_NUMBER = re.compile(r"[-+]?(?=\.?\d)\d*(\.(?P<decimals>\d*))?([eE](?P<exponent>[-+]?\d{1,9}))?", re.ASCII)
 Progress: TypeAlias = Callable[[int, int, str], None]
 
 
+@jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PrintedGain:
     """A gain as printed, and what it was designed for: weights or poles.
@@ -66,20 +70,23 @@ class PrintedGain:
     def placement(cls, texts: Sequence[str], poles: Sequence[complex]) -> "PrintedGain":
         """A gain of pole placement, from its numbers as printed: the digits say how precise they are."""
         gain, unit = _parsed("placement gain", texts)
-        if len(poles) != 4:
+        if polynomial_from_poles(poles).shape != (4,):
             raise InputError("poles", poles, "four of them")
-        polynomial_from_poles(poles)
         return cls(gain, unit, poles=tuple(complex(p) for p in poles))
 
     @classmethod
     def lqr(cls, texts: Sequence[str], Q: Sequence[float], R: float) -> "PrintedGain":
         """A gain of a linear quadratic regulator with Q = diag(...), from its numbers as printed."""
         gain, unit = _parsed("lqr gain", texts)
-        if len(Q) != 4 or not all(math.isfinite(q) and q >= 0.0 for q in Q):
+        try:
+            diagonal, weight = tuple(float(q) for q in Q), float(R)
+        except (TypeError, ValueError) as problem:
+            raise InputError("Q, R", (Q, R), "numbers: the diagonal of Q, and R") from problem
+        if len(diagonal) != 4 or not all(math.isfinite(q) and q >= 0.0 for q in diagonal):
             raise InputError("Q", Q, "four finite numbers, at least 0: the diagonal")
-        if not (math.isfinite(R) and R > 0.0):
+        if not (math.isfinite(weight) and weight > 0.0):
             raise InputError("R", R, "a finite number above 0")
-        return cls(gain, unit, Q=tuple(float(q) for q in Q), R=float(R))
+        return cls(gain, unit, Q=diagonal, R=weight)
 
     @property
     def design(self) -> str:
@@ -204,8 +211,12 @@ def audit_gains(
       progress: called with how much is done, of how much, and what comes next.
 
     Raises:
-      InputError: no gain, an unknown parameter, or a count below 1.
+      InputError: no gain, one of a design that `plant` has no gain for, an unknown parameter, a count below 1 or a
+        negative seed.
     """
+    if not isinstance(plant, CartPole):
+        raise InputError("plant", plant, "a cpjax.CartPole")
+    check("plant", plant)
     if not prints:
         raise InputError("prints", prints, "one printed gain or more")
     unknown = [name for name in parameters if name not in PARAMETERS]
@@ -214,27 +225,22 @@ def audit_gains(
     for field, value, top in (("most", most, len(parameters)), ("starts", starts, 100_000)):
         if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= top:
             raise InputError(field, value, f"a whole number from 1 to {top}")
-    base = np.array([_scale(plant, name) for name in parameters])
-    names = tuple(parameters)
-    fits: list[Fit] = []
-    generator = np.random.default_rng(seed)
-    total = sum(math.comb(len(names), size) for size in range(1, most + 1))
-    for size in range(1, most + 1):
-        sets = list(itertools.combinations(range(len(names)), size))
-        words = f"{len(sets)} sets of {size}, {starts} starts each"
-
-        def report(done: int, before: int = len(fits), words: str = words) -> None:
-            if progress is not None:
-                progress(before + done, total, words)
-
-        report(0)
-        spread = math.log(_START_FACTOR)
-        x = generator.uniform(-spread, spread, (len(sets), starts, size))
-        fits += _fit_all(tuple(prints), plant, names, base, sets, x, report)
-    audit = GainAudit(_residuals_of(prints, plant), tuple(fits), (), plant)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise InputError("seed", seed, "a whole number, at least 0")
+    names, given = tuple(parameters), tuple(prints)
+    unchanged, _ = _linearised(given, plant, names)
+    for printed, rest in zip(given, unchanged.reshape(-1, 4), strict=True):
+        if not np.all(np.isfinite(rest)):
+            allowed = "of a design for which the plant, before any change, has a gain"
+            raise InputError(f"{printed.design} gain", printed.gain, allowed)
+    sets = [chosen for size in range(1, most + 1) for chosen in itertools.combinations(range(len(names)), size)]
+    fits = _fit_all(given, plant, names, sets, _random_starts(sets, most, starts, seed), progress)
+    if progress is not None:
+        progress(len(sets), len(sets), "singular values")
+    audit = GainAudit(tuple(unchanged.tolist()), tuple(fits), (), plant)
     chosen = audit.simplest[0] if audit.simplest else min(fits, key=lambda fit: fit.worst)
     found = changed(plant, dict(zip(chosen.parameters, chosen.values, strict=True)))
-    return dataclasses.replace(audit, directions=_directions(tuple(prints), found, names), plant=found)
+    return dataclasses.replace(audit, directions=_directions(given, found, names), plant=found)
 
 
 def changed(plant: CartPole, changes: Mapping[str, Any]) -> CartPole:
@@ -279,19 +285,19 @@ def _plain(value: Any) -> Any:
 
 def _parsed(field: str, texts: Sequence[str]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Numbers as printed, and the sizes of their last digits."""
-    if len(texts) != 4:
+    if isinstance(texts, str) or len(texts) != 4:
         raise InputError(field, texts, "four numbers as printed")
     values, units = [], []
     for text in texts:
-        mantissa, _, exponent = text.strip().lower().partition("e")
-        try:
-            value, power = float(text), int(exponent or 0)
-        except ValueError as problem:
-            raise InputError(field, text, "a number as printed, such as -24.70") from problem
-        if not math.isfinite(value):
-            raise InputError(field, text, "a finite number")
+        match = _NUMBER.fullmatch(text.strip()) if isinstance(text, str) else None
+        if match is None:
+            raise InputError(field, text, "a number as printed, such as '-24.70'")
+        value = float(text)
+        unit = float(f"1e{int(match['exponent'] or 0) - len(match['decimals'] or '')}")
+        if not (math.isfinite(value) and 0.0 < unit < math.inf):
+            raise InputError(field, text, "a number that fits a float, and its last digit too")
         values.append(value)
-        units.append(10.0 ** (power - len(mantissa.partition(".")[2])))
+        units.append(unit)
     return tuple(values), tuple(units)
 
 
@@ -319,94 +325,147 @@ def _residuals(prints: Sequence[PrintedGain], plant: CartPole) -> jax.Array:
     return (gains - printed) / jnp.asarray([u for p in prints for u in p.unit], dtype=gains.dtype)
 
 
-def _residuals_of(prints: Sequence[PrintedGain], plant: CartPole) -> tuple[float, ...]:
-    return tuple(float(r) for r in jax.jit(lambda p: _residuals(prints, p))(plant))
+def _with_derivatives(
+    prints: tuple[PrintedGain, ...], plant: CartPole, values: Callable[[jax.Array], Mapping[str, Any]], x: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Residuals (4 gains), and their derivatives (4 gains, n) by x (n,), on the plant changed to `values(x)`."""
+
+    def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        r = _residuals(prints, changed(plant, values(x)))
+        return r, r
+
+    J, r = jax.jacfwd(twice, has_aux=True)(x)
+    return r, J
+
+
+def _linearised(prints: tuple[PrintedGain, ...], plant: CartPole, names: tuple[str, ...]) -> tuple[Any, Any]:
+    """Residuals on `plant`, and their derivatives by the named parameters, as NumPy arrays."""
+    numbers = jnp.asarray([_value(plant, name) for name in names])
+    r, J = _compiled_linearisation(prints, cast(plant, numbers.dtype), names, numbers)
+    return np.asarray(r), np.asarray(J)
+
+
+@functools.partial(jax.jit, static_argnames="names")
+def _compiled_linearisation(
+    prints: tuple[PrintedGain, ...], plant: CartPole, names: tuple[str, ...], numbers: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    return _with_derivatives(prints, plant, lambda x: dict(zip(names, x, strict=True)), numbers)
+
+
+def _random_starts(sets: Sequence[tuple[int, ...]], most: int, count: int, seed: int) -> np.ndarray[Any, Any]:
+    """Logarithms of factors (sets, count, most); those beyond a set's size are not used."""
+    generator, spread = np.random.default_rng(seed), math.log(_START_FACTOR)
+    return generator.uniform(-spread, spread, (len(sets), count, most))
 
 
 def _fit_all(
     prints: tuple[PrintedGain, ...],
     plant: CartPole,
     names: tuple[str, ...],
-    base: np.ndarray[Any, Any],
     sets: Sequence[tuple[int, ...]],
     starts: np.ndarray[Any, Any],
-    done: Callable[[int], None],
+    progress: Progress | None,
 ) -> list[Fit]:
-    """The best of all starts for each set of parameters; `starts` (sets, starts, size) are logarithms of factors."""
-
-    def values(chosen: jax.Array, x: jax.Array) -> jax.Array:
-        """The chosen parameters after the change."""
-        return jnp.asarray(base, dtype=x.dtype)[chosen] * jnp.exp(x)
-
+    """The best of all starts (sets, count, most) for each set of parameters."""
+    count, most = starts.shape[1:]
+    # Sets of any size in one program: an index beyond the last parameter stands for one less.
+    padded = np.array([chosen + (len(names),) * (most - len(chosen)) for chosen in sets])
+    chosen, x = np.repeat(padded, count, axis=0), starts.reshape(-1, most)
     own = jnp.asarray([_value(plant, name) for name in names])
-
-    def residuals(chosen: jax.Array, x: jax.Array) -> jax.Array:
-        numbers = own.at[chosen].set(values(chosen, x))
-        return _residuals(prints, changed(plant, dict(zip(names, numbers, strict=True))))
-
-    def one(chosen: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        end = _least_squares(lambda y: residuals(chosen, y), x)
-        return values(chosen, end), residuals(chosen, end)
-
-    count, each, size = starts.shape
-    at_once = max(1, min(count, _LANES // each))
-    run = jax.jit(jax.vmap(one))
-    parts = []
-    for first in range(0, count, at_once):
-        # The last part repeats a set where it is short: one shape, compiled once.
-        rows = np.minimum(np.arange(first, first + at_once), count - 1)
-        lanes = np.repeat(np.asarray(sets)[rows], each, axis=0), starts[rows].reshape(-1, size)
-        parts.append([np.asarray(a).reshape(at_once, each, -1) for a in run(*map(jnp.asarray, lanes))])
-        done(min(first + at_once, count))
-    found, rest = (np.concatenate(part)[:count] for part in zip(*parts, strict=True))
-    cost = np.where(np.isfinite(rest).all(axis=-1), np.sum(rest**2, axis=-1), np.inf)
+    base = jnp.asarray([_scale(plant, name) for name in names])
+    lanes = min(_LANES, len(x))
+    ends = []
+    for first in range(0, len(x), lanes):
+        if progress is not None:
+            text = f"sets of up to {most} parameters, {count} starts each"
+            progress(first // count, len(sets), text)
+        now = np.arange(first, first + lanes) % len(x)  # what the last round has too much is dropped below
+        ends.append(_fitted(prints, cast(plant, own.dtype), names, own, base, chosen[now], jnp.asarray(x[now])))
+    found, rest = (np.concatenate(a)[: len(x)].reshape(len(sets), count, -1) for a in zip(*ends, strict=True))
+    cost = np.sum(rest**2, axis=-1)
     fits = []
-    for row, chosen in enumerate(sets):
+    for row, members in enumerate(sets):
         best = int(np.argmin(cost[row]))
         lowest = cost[row, best]
-        reached = float(np.mean(cost[row] <= lowest + np.maximum(0.01 * lowest, 0.01)))
+        agree = cost[row] <= lowest + max(0.01 * lowest, 0.01)
         fits.append(
             Fit(
-                tuple(names[i] for i in chosen),
-                tuple(float(v) for v in found[row, best]),
-                tuple(float(r) for r in rest[row, best]),
-                reached,
+                tuple(names[i] for i in members),
+                tuple(found[row, best, : len(members)].tolist()),
+                tuple(rest[row, best].tolist()),
+                float(np.mean(agree & np.isfinite(cost[row]))),
             )
         )
     return fits
 
 
-def _least_squares(residuals: Callable[[jax.Array], jax.Array], x: jax.Array) -> jax.Array:
-    """Minimises the residuals' sum of squares by Levenberg and Marquardt's method, from x (n,)."""
+@functools.partial(jax.jit, static_argnames="names")
+def _fitted(
+    prints: tuple[PrintedGain, ...],
+    plant: CartPole,
+    names: tuple[str, ...],
+    own: jax.Array,
+    base: jax.Array,
+    chosen: jax.Array,
+    starts: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """The chosen parameters (lanes, most) and the residuals (lanes, 4 gains) where each start ends.
 
-    def evaluated(x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        J, r = jax.jacfwd(lambda y: (residuals(y),) * 2, has_aux=True)(x)
-        return x, r, J
+    Args:
+      own: (names,) values of the parameters that are not chosen.
+      base: (names,) what the exponentials of `starts` are factors of.
+      chosen: (lanes, most) indices into `names`, or their number for none.
+      starts: (lanes, most).
+    """
+    own, base = jnp.append(own, 1.0), jnp.append(base, 1.0)
 
-    def step(carry: tuple[Any, jax.Array], _: None) -> tuple[Any, None]:
-        (x, r, J), damping = carry
+    def one(chosen: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def values(x: jax.Array) -> dict[str, jax.Array]:
+            numbers = own.at[chosen].set(base[chosen] * jnp.exp(x))
+            return dict(zip(names, numbers[:-1], strict=True))
+
+        end, rest = _least_squares(lambda x: _with_derivatives(prints, plant, values, x), x, 4 * len(prints))
+        return base[chosen] * jnp.exp(end), rest
+
+    return jax.vmap(one)(chosen, starts)
+
+
+def _least_squares(
+    residuals: Callable[[jax.Array], tuple[jax.Array, jax.Array]], x: jax.Array, count: int
+) -> tuple[jax.Array, jax.Array]:
+    """Minimises the residuals' sum of squares by Levenberg and Marquardt's method, from x (n,).
+
+    Args:
+      residuals: gives residuals (count,) and their derivatives (count, n).
+
+    Returns:
+      Where it ends (n,), and the residuals there (count,); these are infinite if they are not finite at the start.
+    """
+
+    def step(carry: tuple[Any, ...], _: None) -> tuple[Any, None]:
+        trial, best, damping = carry
+        r, J = residuals(trial)
+        tried = (jnp.sum(r * r), trial, r, J)
+        better = tried[0] < best[0]  # False for NaN
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, best)
+        damping = jnp.clip(jnp.where(better, damping / 5.0, damping * 4.0), 1e-12, 1e8)
+        _, x, r, J = best
         H = J.T @ J
-        damped = H + damping * jnp.diag(jnp.diagonal(H) + np.finfo(x.dtype).tiny)
+        scale = jnp.diagonal(H)
+        damped = H + damping * jnp.diag(jnp.where(scale > 0.0, scale, 1.0))
         # A relative change by more than e in one step leaves the region where a derivative means something.
-        trial = evaluated(x - jnp.clip(linear_solve(damped, (J.T @ r)[:, None])[:, 0], -1.0, 1.0))
-        better = jnp.sum(trial[1] ** 2) < jnp.sum(r * r)  # False for NaN
-        kept = jax.tree.map(lambda a, b: jnp.where(better, a, b), trial, (x, r, J))
-        return (kept, jnp.clip(jnp.where(better, damping / 5.0, damping * 4.0), 1e-12, 1e8)), None
+        return (x - jnp.clip(linear_solve(damped, (J.T @ r)[:, None])[:, 0], -1.0, 1.0), best, damping), None
 
-    ((x, _, _), _), _ = lax.scan(step, (evaluated(x), jnp.asarray(1e-2, dtype=x.dtype)), length=_STEPS)
-    return x
+    unknown = jnp.full((count,), jnp.inf, dtype=x.dtype)
+    nowhere = (unknown[0], x, unknown, jnp.zeros((count, x.shape[0]), dtype=x.dtype))
+    (_, (_, x, rest, _), _), _ = lax.scan(step, (x, nowhere, jnp.asarray(5e-2, dtype=x.dtype)), length=_STEPS + 1)
+    return x, rest
 
 
 def _directions(prints: tuple[PrintedGain, ...], plant: CartPole, names: tuple[str, ...]) -> tuple[Direction, ...]:
-    """Singular values and vectors of the gains' dependence on the logarithms of all parameters, at `plant`."""
-    sizes = jnp.asarray([_scale(plant, name) for name in names])
-    own = jnp.asarray([_value(plant, name) for name in names])
-
-    def residuals(x: jax.Array) -> jax.Array:
-        return _residuals(prints, changed(plant, dict(zip(names, own + sizes * x, strict=True))))
-
-    J = np.asarray(jax.jit(jax.jacfwd(residuals))(jnp.zeros_like(sizes)))
-    _, values, vectors = np.linalg.svd(J, full_matrices=True)
+    """Singular values and vectors of the gains' dependence on relative changes of all parameters, at `plant`."""
+    _, J = _linearised(prints, plant, names)
+    _, values, vectors = np.linalg.svd(J * [_scale(plant, name) for name in names], full_matrices=True)
     values = np.concatenate([values, np.zeros(len(names))])[: len(names)]
     values = np.where(values < 1e-9 * values[0], 0.0, values)  # rounding
     return tuple(
