@@ -189,6 +189,9 @@ CASES = [
     {"controller.design": "lqr"},
     {"controller.gains": "computed"},
     {"controller.K": [-1.0, 2.0, -3.5, 1e-3]},
+    {"controller.Q": [20.0, 1.0, 50.0, 2.5]},
+    {"controller.R": 0.01},
+    {"controller.poles": ["-3", "-4", "-5+2j", "-5-2j"]},
     *(
         {f"controller.{name}": 0.25}
         for name in ("energy_gain", "cart_stiffness", "cart_damping", "kick", "kick_radius")
@@ -521,7 +524,7 @@ def test_odd_names_of_folders_are_taken_as_they_are(command, workplace, no_pictu
 # --- help, version, exit codes ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["swingup", "reproduce", "report"])
+@pytest.mark.parametrize("name", ["swingup", "design", "reproduce", "audit-gains", "report"])
 def test_the_help_of_a_command_exits_with_0_and_names_what_every_command_has(command, name):
     result = command(name, "--help")
     assert (result.code, result.err) == (0, "")
@@ -539,7 +542,7 @@ def test_the_help_of_swingup_names_every_option_with_its_section(command):
 def test_the_main_help_names_the_commands_and_the_exit_codes(command):
     result = command("--help")
     assert result.code == 0
-    for word in ("swingup", "reproduce", "report", "exit codes", "130"):
+    for word in ("swingup", "design", "reproduce", "audit-gains", "report", "exit codes", "130"):
         assert word in result.out
 
 
@@ -774,7 +777,8 @@ def report(tmp_path_factory):
 
 def test_a_report_writes_its_page_beside_the_rows_and_pictures(report):
     assert report.code == 0
-    assert {p.name for p in report.folder.iterdir()} == {"report.html", "reproduction.json", *FIGURES}
+    data = {"reproduction.json", "designs.json", "audit_gains.json"}
+    assert {p.name for p in report.folder.iterdir()} == {"report.html", "audit_gains.png", *data, *FIGURES}
 
 
 def test_a_reports_rows_are_those_of_the_reproduction(report, reproduced):
@@ -798,7 +802,7 @@ def test_a_report_is_one_valid_page_that_loads_nothing_from_elsewhere(report):
 
 def test_every_picture_of_a_report_is_inside_it_and_described(report):
     pictures = [attributes for tag, attributes in report.page.tags if tag == "img"]
-    assert len(pictures) == len(FIGURES)
+    assert len(pictures) == len(FIGURES) + 1
     for picture in pictures:
         assert picture["src"].startswith("data:image/png;base64,iVBOR")
         assert len(picture["alt"]) > 20
@@ -806,7 +810,7 @@ def test_every_picture_of_a_report_is_inside_it_and_described(report):
 
 def test_the_numbers_in_a_reports_table_are_those_of_its_json(report):
     rows = document(report.folder, "reproduction.json")["rows"]
-    header, *body = report.page.rows
+    header, *body = report.page.rows[:33]
     assert len(body) == len(rows) == 32
     for cells, row in zip(body, rows, strict=True):
         shown = dict(zip(header, cells, strict=True))
@@ -828,6 +832,29 @@ def test_the_numbers_in_a_reports_table_are_those_of_its_json(report):
         assert shown["peak [V]"] == f"{row['over_all']['peak_voltage']['max']:.1f}"
 
 
+def test_the_designs_in_a_report_are_those_of_its_json(report):
+    designs = document(report.folder, "designs.json")
+    header, *body = report.page.rows[33:38]
+    assert header[0] == "regulator"
+    assert len(body) == len(designs) == 4
+    for cells, check in zip(body, designs.values(), strict=True):
+        shown = dict(zip(header, cells, strict=True))
+        assert shown["voltage at the switch [V]"] == f"{check['gate_voltage']:.0f}"
+        assert shown["saturates beyond [deg]"] == f"{math.degrees(check['saturation_angle']):.2f}"
+        assert shown["phase margin [deg]"] == f"{math.degrees(check['margins']['phase']):.0f}"
+    assert [round(check["gate_voltage"]) for check in designs.values()] == [58, 61, 2511, 2512]
+
+
+def test_the_audit_in_a_report_is_that_of_its_json(report):
+    audit = document(report.folder, "audit_gains.json")
+    explaining = [row for row in report.page.rows if row and row[0] == "torque_constant, back_emf_constant"]
+    assert len(explaining) == 1
+    fit = next(f for f in audit["simplest"] if f["parameters"] == ["torque_constant", "back_emf_constant"])
+    assert explaining[0][2] == f"{fit['worst']:.3g}"
+    assert explaining[0][3:5] == ["1.03846", "1.93006"]
+    assert f"{len(audit['simplest'])} of 91" in "".join(report.page.words)
+
+
 def test_a_report_names_its_setting_and_the_command_that_makes_it_again(report):
     text = "".join(report.page.words)
     assert "8 starts from the set hanging (seed 1), 12 s each, RK4 with a step of 10 ms" in text
@@ -836,6 +863,8 @@ def test_a_report_names_its_setting_and_the_command_that_makes_it_again(report):
 
 def test_a_report_of_odd_numbers_gives_the_command_with_all_their_digits(command, tmp_path, no_pictures, monkeypatch):
     monkeypatch.setattr(reproduction, "evaluate", fake_evaluate)
+    for section in ("_designs", "_forensics"):
+        monkeypatch.setattr(cpjax.cli.report, section, lambda page, given: None)
     command("report", "--out", tmp_path, "--count", "3", "--duration", "1.23456789", "--dt", "0.00123456789")
     text = "".join(Page((tmp_path / "report.html").read_text(encoding="utf-8")).words)
     assert "--duration 1.23456789 --dt 0.00123456789" in text

@@ -7,7 +7,7 @@ come from the fields of the classes themselves.
 
 import argparse
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -240,13 +240,24 @@ def _build_regulator(changes: dict[str, Any], plant: CartPole, reference: State)
             raise InputError("design", asked, "placement with poles, or lqr with Q and R")
         if given.get("gains", "computed") != "computed":
             raise InputError("gains", given["gains"], "computed, where poles or weights are given")
-        A, B = linearize(plant)
         if poles is not None:
-            return StateFeedback(place(A, B, parse_poles(poles)), reference)
-        return StateFeedback(lqr(A, B, *_weights(weights)).K, reference)
+            K = _designed("gain", plant, lambda A, B: place(A, B, parse_poles(poles)))
+        else:
+            K = _designed("gain", plant, lambda A, B: lqr(A, B, *_weights(weights)).K)
+        return StateFeedback(K, reference)
     return StateFeedback(
         paper.regulator(given.get("design", "placement"), given.get("gains", "printed"), plant).K, reference
     )
+
+
+def _designed(what: str, plant: CartPole, design: Callable[[Any, Any], Any]) -> Any:
+    """What `design` makes of the linear model; if that is impossible, it is the plant's fault as well."""
+    try:
+        return design(*linearize(plant))
+    except InputError as problem:
+        if problem.field not in ("A", "B", "Q"):
+            raise
+        raise InputError("plant", plant, f"one for which this {what} can be computed ({problem})") from problem
 
 
 def _weights(given: Mapping[str, Any]) -> tuple[np.ndarray[Any, Any], list[list[float]]]:
@@ -278,7 +289,8 @@ def _build_gate(changes: dict[str, Any], plant: CartPole, reference: State, weig
         if key in rules(cls) and key not in changes:
             raise InputError(key, None, f"given: the gate {name} needs it")
     if cls is LyapunovGate:
-        return LyapunovGate(lqr(*linearize(plant), *_weights(weights)).P, reference=reference, **changes)
+        P = _designed("lyapunov gate", plant, lambda A, B: lqr(A, B, *_weights(weights)).P)
+        return LyapunovGate(P, reference=reference, **changes)
     return cls(**{"half_angle": paper.SWITCH_ANGLE, **changes})
 
 
