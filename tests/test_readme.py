@@ -29,8 +29,18 @@ def test_the_python_of_the_readme_runs(capsys):
     assert abs(float(third)) > 1e-6
 
 
-def test_the_cpjax_commands_of_the_readme_are_understood():
-    found = [c for c in commands(PAGES[0]) if c.startswith("cpjax ")]
+def test_the_python_of_the_design_page_runs():
+    page = (ROOT / "docs" / "design.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    assert len(blocks) >= 3
+    names = {}
+    exec(compile("\n".join(blocks), "design.md", "exec"), names)
+    assert names["sensitivity"].shape == (1, 4, 1, 1)
+    assert names["factors"].poles().shape == (4,)
+
+
+def test_the_cpjax_commands_of_the_pages_are_understood():
+    found = [c for page in PAGES for c in commands(page) if c.startswith("cpjax ")]
     assert len(found) >= 5
     for command in found:
         make_parser().parse_args(shlex.split(command)[1:])

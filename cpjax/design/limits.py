@@ -3,6 +3,8 @@
 Inside the clip and the gate the loop is s' = A_K s to first order, and s' P s falls along it. The largest level set
 {s' P s <= level} that stays inside both is one that the linearised loop, once in, never leaves. It says so of the
 linear model; for the plant itself it is a guide, to be checked by rollouts.
+
+Every level asks for a P that is positive definite, and counts its symmetric part only; under jit, another gives NaN.
 """
 
 import math
@@ -14,12 +16,12 @@ from jax import lax
 
 from cpjax.design.arguments import MatrixLike, matrices, shaped, square
 from cpjax.design.lyapunov import lyapunov
-from cpjax.numeric.small_matrices import linear_solve
-from cpjax.pytree import Number, Scalar
+from cpjax.errors import InputError
+from cpjax.numeric.small_matrices import is_positive_definite, linear_solve
+from cpjax.pytree import Number, Scalar, is_traced
 
 _THETA = 2  # where the angle stands in the state
 _RATE = 3
-_POINTS = 256
 
 
 def demanded_voltage(K: MatrixLike, angle: Scalar) -> jax.Array:
@@ -35,8 +37,7 @@ def saturation_angle(K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
     """
     (K,) = matrices(K=K)
     shaped("K", K, (1, 4))
-    limit = _above_zero("voltage_limit", "V", voltage_limit)
-    return limit / jnp.abs(K[0, _THETA])
+    return _limit("voltage_limit", "V", voltage_limit, K, infinite=True) / jnp.abs(K[0, _THETA])
 
 
 def lyapunov_function(A: MatrixLike, B: MatrixLike, K: MatrixLike, Q: MatrixLike) -> jax.Array:
@@ -53,55 +54,93 @@ def lyapunov_function(A: MatrixLike, B: MatrixLike, K: MatrixLike, Q: MatrixLike
 
 
 def level_within_voltage(P: MatrixLike, K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
-    """The largest level at which |K s| stays within `voltage_limit` [V] wherever s' P s is at most that level."""
+    """The largest level at which |K s| stays within `voltage_limit` [V] wherever s' P s is at most that level.
+
+    Raises:
+      InputError: shapes that do not fit, a concrete P that is not positive definite, or a limit that is not above 0.
+    """
     P, K = matrices(P=P, K=K)
+    P = _positive_definite("P", P)
     shaped("K", K, (1, square("P", P)))
-    limit = _above_zero("voltage_limit", "V", voltage_limit)
+    limit = _limit("voltage_limit", "V", voltage_limit, P, infinite=True)
     return limit * limit / (K @ linear_solve(P, K.T))[0, 0]
 
 
 def level_within_angle(P: MatrixLike, half_angle: Scalar) -> jax.Array:
-    """The largest level at which |theta| stays within `half_angle` [rad]: inside an AngleGate."""
+    """The largest level at which |theta| stays within `half_angle` [rad]: inside an AngleGate. P is (4, 4).
+
+    Raises:
+      InputError: see `level_within_voltage`; or an angle beyond pi.
+    """
     (P,) = matrices(P=P)
-    shaped("P", P, (4, 4))
-    edge = _above_zero("half_angle", "rad", half_angle)
+    P = _positive_definite("P", P, 4)
+    edge = _limit("half_angle", "rad", half_angle, P, at_most=math.pi)
     return edge * edge / _spread(P, (_THETA,))[0, 0]
 
 
 def level_within_angle_and_rate(P: MatrixLike, half_angle: Scalar, rate: Scalar) -> jax.Array:
-    """The largest level inside an AngleRateGate: (1 - cos theta) / (1 - cos half_angle) + (theta' / rate)^2 <= 1."""
+    """The largest level inside an AngleRateGate: (1 - cos theta) / (1 - cos half_angle) + (theta' / rate)^2 <= 1.
+
+    P is (4, 4), half_angle in rad, rate in rad/s.
+
+    Raises:
+      InputError: see `level_within_angle`.
+    """
     (P,) = matrices(P=P)
-    shaped("P", P, (4, 4))
-    half_angle = _above_zero("half_angle", "rad", half_angle)
-    rate = _above_zero("rate", "rad/s", rate)
+    P = _positive_definite("P", P, 4)
+    half_angle = _limit("half_angle", "rad", half_angle, P, at_most=math.pi)
+    rate = _limit("rate", "rad/s", rate, P)
     shadow = _spread(P, (_THETA, _RATE))
+
+    form = linear_solve(shadow, jnp.eye(2, dtype=P.dtype))
+    half_edge, half_cos = jnp.sin(0.5 * half_angle), jnp.cos(0.5 * half_angle)
+    # Positions are angles in the plane in which the level set's shadow is about as wide as it is high: however far
+    # apart angle and rate are in size, the level changes over no small part of a turn.
+    spread = jnp.sqrt(jnp.diagonal(shadow))
+    ratio = lax.stop_gradient(half_angle * spread[1] / (rate * spread[0]))
 
     def level(position: jax.Array) -> jax.Array:
         """At a point of the gate's boundary, half of which is passed as `position` goes from 0 to pi."""
-        angle = 2.0 * jnp.arcsin(jnp.sin(0.5 * half_angle) * jnp.sin(position))
-        point = jnp.stack([angle, rate * jnp.cos(position)])
-        return point @ linear_solve(shadow, point[:, None])[:, 0]
+        sin, cos = jnp.sin(position), ratio * jnp.cos(position)
+        sin, cos = jnp.stack([sin, cos]) / jnp.hypot(sin, cos)
+        angle = 2.0 * jnp.arctan2(half_edge * sin, jnp.hypot(half_cos, half_edge * cos))
+        point = jnp.stack([angle, rate * cos])
+        return point @ form @ point
 
-    # The level set's shadow touches the boundary where the level is smallest. There, by the envelope theorem, the
-    # minimum's derivative is that at a fixed position.
-    positions = jnp.linspace(0.0, math.pi, _POINTS, endpoint=False, dtype=P.dtype)
-    position = positions[jnp.argmin(jax.vmap(level)(positions))]
+    # The level set's shadow touches the boundary where the level is smallest. A half angle near pi gives the boundary
+    # two corners, so the search narrows down before Newton's method refines it.
+    width = 0.5 * math.pi
+    position = jnp.asarray(width, dtype=P.dtype)
+    for points in (257, 65, 65):
+        positions = position + width * jnp.linspace(-1.0, 1.0, points, dtype=P.dtype)
+        position = positions[jnp.argmin(jax.vmap(level)(positions))]
+        width = 2.0 * width / (points - 1)
     slope, curvature = jax.grad(level), jax.grad(jax.grad(level))
-    for _ in range(4):
-        step = slope(position) / curvature(position)
-        position = position - jnp.clip(jnp.nan_to_num(step), -math.pi / _POINTS, math.pi / _POINTS)
-    return level(lax.stop_gradient(position))
+    for _ in range(2):
+        step = jnp.clip(jnp.nan_to_num(slope(position) / curvature(position)), -width, width)
+        position = jnp.where(level(position - step) < level(position), position - step, position)
+    position = lax.stop_gradient(position)
+    # By the envelope theorem the minimum's derivative is that at a fixed position. For the second one, the position
+    # moves as one more step of Newton's moves it; where the level is the same everywhere, it need not.
+    bend = lax.stop_gradient(curvature(position))
+    return level(position - jnp.where(bend > 0.0, slope(position) / jnp.where(bend > 0.0, bend, 1.0), 0.0))
 
 
 def level_within_form(P: MatrixLike, other: MatrixLike, level: Scalar) -> jax.Array:
-    """The largest level at which s' `other` s stays within `level`: inside a LyapunovGate of another P."""
+    """The largest level at which s' `other` s stays within `level`: inside a LyapunovGate of another P.
+
+    `other` is symmetric, of the shape of P; infinite where it is nowhere positive.
+
+    Raises:
+      InputError: see `level_within_voltage`.
+    """
     P, other = matrices(P=P, other=other)
-    n = square("P", P)
-    shaped("other", other, (n, n))
-    level = _above_zero("level", "1", level)
+    P = _positive_definite("P", P)
+    shaped("other", other, P.shape)
+    level = _limit("level", "1", level, P)
     root = jnp.linalg.cholesky(P)
     ratio = linear_solve(root, linear_solve(root, other).T)
-    return level / jnp.linalg.eigvalsh(0.5 * (ratio + ratio.T))[-1]
+    return level / jnp.maximum(jnp.linalg.eigvalsh(0.5 * (ratio + ratio.T))[-1], 0.0)
 
 
 def _spread(P: jax.Array, chosen: tuple[int, ...]) -> jax.Array:
@@ -110,5 +149,19 @@ def _spread(P: jax.Array, chosen: tuple[int, ...]) -> jax.Array:
     return columns.T @ linear_solve(P, columns)
 
 
-def _above_zero(name: str, unit: str, value: Scalar) -> Any:
-    return Number(unit, name, above=0.0).normalise(name, value)
+def _positive_definite(name: str, P: jax.Array, size: int | None = None) -> jax.Array:
+    """The symmetric part of a positive definite matrix; NaN for another that is traced."""
+    n = square(name, P)
+    shaped(name, P, (size or n,) * 2)
+    P = 0.5 * (P + P.T)
+    definite = is_positive_definite(lax.stop_gradient(P))
+    if not is_traced(definite) and not definite:
+        raise InputError(name, P, "positive definite, by a margin that rounding leaves visible")
+    return jnp.where(definite, P, jnp.nan)
+
+
+def _limit(name: str, unit: str, value: Scalar, like: jax.Array, **ends: Any) -> jax.Array:
+    """A scalar above zero, in the dtype of `like`."""
+    limit = jnp.asarray(Number(unit, name, above=0.0, **ends).normalise(name, value), dtype=like.dtype)
+    shaped(name, limit, ())
+    return limit

@@ -165,7 +165,8 @@ class QuadraticFactors(NamedTuple):
     def poles(self) -> jax.Array:
         """The complex roots (n,), to read: they have no derivative where two of them meet [1/s]."""
         root = jnp.sqrt(lax.complex(self.a * self.a / 4 - self.b, jnp.zeros_like(self.a)))
-        return jnp.concatenate([root - self.a / 2, -root - self.a / 2, -self.c.astype(root.dtype)])
+        half = (0.5 * self.a).astype(root.dtype)
+        return jnp.concatenate([root - half, -root - half, -self.c.astype(root.dtype)])
 
 
 def _radius(coefficients: jax.Array) -> jax.Array:

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from cpjax.plant import CartPole, Motor
 from cpjax.pytree import Number, rules
@@ -14,6 +15,8 @@ from cpjax.study.forensics import EXPLAINED, Direction, Fit, GainAudit, changed
 
 FIT_HEADER = ("changed", "to", "worst residual", "force per volt [N/V]", "total damping [N s/m]", "starts that agree")
 DIRECTION_HEADER = ("combination of relative changes", "sensitivity", "known to")
+
+_ROUGHLY = 5.0  # sensitivity at which a change of 10 % is half a last digit
 
 
 def fit_cells(fit: Fit, plant: CartPole) -> list[str]:
@@ -50,28 +53,25 @@ def findings(audit: GainAudit) -> list[str]:
     worst = max(abs(r) for r in audit.unchanged)
     within = sum(abs(r) <= EXPLAINED for r in audit.unchanged)
     sentences = [
-        f"On the plant as given, {within} of the {len(audit.unchanged)} printed gains follow to within one unit of "
-        f"their last digit; the worst is {worst:.0f} units off."
+        f"On the plant as given, {within} of {len(audit.unchanged)} printed gains come out to within one unit of their "
+        f"last digit; the worst is {worst:.3g} units off."
     ]
     for size in sorted({len(fit.parameters) for fit in audit.fits}):
         fits = [fit for fit in audit.fits if len(fit.parameters) == size]
         best, good = audit.best(size), sum(fit.explains for fit in fits)
-        kind = "single parameter" if size == 1 else f"set of {size} parameters"
-        if good:
-            sentences.append(
-                f"Where one {kind} may change, {good} of {len(fits)} choices explain every gain, with a worst residual "
-                f"of {best.worst:.2f} units of the last digit (rounding leaves up to 0.5)."
-            )
-        else:
-            sentences.append(
-                f"No {kind} explains the gains: the best of {len(fits)}, {' and '.join(best.parameters)}, leaves "
-                f"{best.worst:.3g} units."
-            )
+        kind = "Single parameters" if size == 1 else f"Sets of {size} parameters"
+        sentences.append(
+            f"{kind}: {good or 'none'} of {len(fits)} may change and explain every gain. The best, "
+            f"{' and '.join(best.parameters)}, leaves {best.worst:.3g} units"
+            + (" (rounding alone leaves up to 0.5)." if good else ".")
+        )
     known = [d for d in audit.directions if d.identified]
+    unknown = sum(d.sensitivity == 0.0 for d in audit.directions)
     sentences.append(
-        f"There, the gains fix {len(known)} combinations of the {len(audit.directions)} parameters to better than 10 %"
-        + (f", the last to {100 * known[-1].known_to:.2g} %" if known else "")
-        + f", and say nothing about {sum(d.sensitivity == 0.0 for d in audit.directions)} others."
+        f"About the plant found: of {len(audit.directions)} independent combinations of parameters, the gains fix "
+        f"{len(known)} to better than 10 %"
+        + (f" (the last of them to {100 * known[-1].known_to:.2g} %)" if known else "")
+        + f", {len(audit.directions) - len(known) - unknown} less well and {unknown} not at all."
     )
     return sentences
 
@@ -86,14 +86,18 @@ def picture(audit: GainAudit) -> Figure:
     values = [d.sensitivity for d in audit.directions]
     shown = [v if v > 0 else math.nan for v in values]
     right.semilogy(range(1, len(values) + 1), shown, "o", color="#0072B2", label="known by the gains")
-    floor = min((v for v in values if v > 0), default=1.0) / 10
     zeros = [i + 1 for i, v in enumerate(values) if v == 0]
-    right.semilogy(zeros, [floor] * len(zeros), "v", color="#D55E00", label="0: not known at all")
-    right.axhline(5.0, color="#999999", linestyle="--", label="a change of 10 % is half a last digit")
+    if zeros:  # below everything else, at the axis's foot: a logarithmic one has no place for them
+        foot = right.get_xaxis_transform()
+        right.plot(zeros, [0.04] * len(zeros), "v", color="#D55E00", transform=foot, label="0: not known at all")
+        right.set_ylim(bottom=min([_ROUGHLY, *(v for v in values if v > 0)]) / 20)
+    right.axhline(_ROUGHLY, color="#999999", linestyle="--", label="a change of 10 % is half a last digit")
     right.set_xlabel("combination of parameters, best known first")
     right.set_ylabel("units of the last digit per relative change by 1")
     right.set_title("What the gains know of the plant", loc="left")
-    right.legend(frameon=False)
+    right.set_xlim(0.5, len(values) + 0.5)
+    right.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+    right.legend(frameon=False, loc="upper left", bbox_to_anchor=(0.0, -0.1))  # the points may be anywhere inside
     right.grid(alpha=0.3)
     return figure
 
@@ -104,7 +108,9 @@ def _residual_map(figure: Figure, axes: Axes, audit: GainAudit, names: Sequence[
         if len(fit.parameters) <= 2:
             i, j = (names.index(n) for n in (fit.parameters * 2)[:2])
             worst[i, j] = worst[j, i] = fit.worst
-    image = axes.imshow(np.maximum(worst, 1e-3), norm=LogNorm(0.1, np.nanmax(worst)), cmap="cividis_r")
+    top = np.max(worst, where=np.isfinite(worst), initial=EXPLAINED)
+    # Cells need not be square: with a fixed aspect, the layout does not see how much room the labels need.
+    image = axes.imshow(np.maximum(worst, 1e-3), norm=LogNorm(0.1, top), cmap="cividis_r", aspect="auto")
     for (i, j), value in np.ndenumerate(worst):
         if value <= EXPLAINED:
             axes.plot(j, i, "o", color="white", markersize=7, markeredgecolor="black")
@@ -113,7 +119,7 @@ def _residual_map(figure: Figure, axes: Axes, audit: GainAudit, names: Sequence[
     axes.set_title(
         "Worst residual when two parameters (diagonal: one) may change;\ncircles: every gain is explained", loc="left"
     )
-    figure.colorbar(image, ax=axes, label="units of the last printed digit", shrink=0.8)
+    figure.colorbar(image, ax=axes, label="units of the last printed digit")
 
 
 def _residual_bars(axes: Axes, audit: GainAudit, names: Sequence[str]) -> None:
@@ -124,4 +130,4 @@ def _residual_bars(axes: Axes, audit: GainAudit, names: Sequence[str]) -> None:
     axes.invert_yaxis()
     axes.set_xlabel("worst residual [units of the last printed digit]")
     axes.set_title("When one parameter may change", loc="left")
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(0.0, -0.1))

@@ -289,10 +289,10 @@ def _parsed(field: str, texts: Sequence[str]) -> tuple[tuple[float, ...], tuple[
         raise InputError(field, texts, "four numbers as printed")
     values, units = [], []
     for text in texts:
-        match = _NUMBER.fullmatch(text.strip()) if isinstance(text, str) else None
+        match = _NUMBER.fullmatch(text.strip().replace("\u2212", "-")) if isinstance(text, str) else None
         if match is None:
             raise InputError(field, text, "a number as printed, such as '-24.70'")
-        value = float(text)
+        value = float(match[0])
         unit = float(f"1e{int(match['exponent'] or 0) - len(match['decimals'] or '')}")
         if not (math.isfinite(value) and 0.0 < unit < math.inf):
             raise InputError(field, text, "a number that fits a float, and its last digit too")
