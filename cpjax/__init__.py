@@ -17,7 +17,7 @@ from cpjax.controllers import (
     LyapunovGate,
     StateFeedback,
 )
-from cpjax.design.discretization import discretize
+from cpjax.design.discretization import discretize, discretize_cost
 from cpjax.design.lqr import dlqr, lqr
 from cpjax.design.placement import QuadraticFactors, place, place_polynomial
 from cpjax.design.riccati import care, dare
@@ -61,6 +61,7 @@ __all__ = [
     "care",
     "dare",
     "discretize",
+    "discretize_cost",
     "dlqr",
     "linearize",
     "load",

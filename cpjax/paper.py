@@ -148,9 +148,14 @@ def computed_gain(design: Design, plant: CartPole) -> jax.Array:
     _check_choice("design", design, get_args(Design))
     A, B = linearize(plant)
     try:
-        return place(A, B, POLES) if design == "placement" else lqr(A, B, np.diag(Q), [[R]]).K
+        return place(A, B, POLES) if design == "placement" else lqr(A, B, _state_weight(), R).K
     except InputError as problem:
         raise InputError("plant", plant, f"one for which a {design} gain can be computed ({problem})") from problem
+
+
+def _state_weight() -> list[list[float]]:
+    """Q as a matrix; a list takes the dtype of the plant's model."""
+    return np.diag(Q).tolist()
 
 
 def riccati_solution(plant: CartPole) -> jax.Array:
@@ -161,7 +166,7 @@ def riccati_solution(plant: CartPole) -> jax.Array:
     """
     A, B = linearize(plant)
     try:
-        return lqr(A, B, np.diag(Q), [[R]]).P
+        return lqr(A, B, _state_weight(), R).P
     except InputError as problem:
         raise InputError("plant", plant, f"one for which an lqr gain can be computed ({problem})") from problem
 

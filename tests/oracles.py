@@ -1,5 +1,6 @@
 """What the tests compare cpjax with, written from the physics in NumPy; of cpjax it reads parameters only."""
 
+import itertools
 import math
 
 import jax.numpy as jnp
@@ -161,3 +162,38 @@ def dop853(field, start, span, **options):
 def fitted_order(steps, errors):
     """Slope of log(error) over log(step)."""
     return np.polyfit(np.log(steps), np.log(errors), 1)[0]
+
+
+def jacobian(function, x, steps, levels=3):
+    """(..., k) at a vector x (k,), by central differences with the steps, half of them, ..., extrapolated (Richardson).
+
+    `function` takes many vectors at once, (b, k), as a JAX function under `vmap` does.
+    """
+    x = np.asarray(x, dtype=np.float64)
+    halvings = [np.diag(np.broadcast_to(steps, x.shape)) / 2**level for level in range(levels)]
+    points = np.stack([[x + moves, x - moves] for moves in halvings])
+    values = np.asarray(function(jnp.asarray(points.reshape(-1, x.size))), dtype=np.float64)
+    values = values.reshape(levels, 2, x.size, *values.shape[1:])
+    columns = [
+        (above - below) / (2 * np.diag(moves)).reshape(-1, *[1] * (values.ndim - 3))
+        for (above, below), moves in zip(values, halvings, strict=True)
+    ]
+    for order in range(1, levels):
+        columns = [(4**order * fine - coarse) / (4**order - 1) for coarse, fine in itertools.pairwise(columns)]
+    return np.moveaxis(columns[0], 0, -1)
+
+
+def relative_error(found, right):
+    """Frobenius norm of the difference over that of `right`; infinite where `found` is not finite."""
+    found, right = np.asarray(found, dtype=np.float64), np.asarray(right, dtype=np.float64)
+    if not np.all(np.isfinite(found)):
+        return math.inf
+    return float(np.linalg.norm(found - right) / np.linalg.norm(right))
+
+
+def lyapunov_operator(A, time):
+    """The matrix (n n, n n) that takes X, row by row, to A' X + X A, or in discrete time to A' X A - X."""
+    identity = np.eye(len(A), dtype=A.dtype)
+    if time == "continuous":
+        return np.kron(A.T, identity) + np.kron(identity, A.T)
+    return np.kron(A.T, A.T) - np.kron(identity, identity)

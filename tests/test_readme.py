@@ -56,6 +56,11 @@ def test_the_make_targets_and_scripts_that_the_pages_name_exist():
             assert (ROOT / script).exists(), f"{page.name} names {script}"
 
 
+def test_no_page_has_a_gap_left_to_fill():
+    for page in PAGES:
+        assert re.findall(r"^.*\b[A-Z0-9]+_(?:TABLE|NOTE)\b.*$", page.read_text(), flags=re.MULTILINE) == []
+
+
 def test_no_page_has_a_broken_link():
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#]+)", page.read_text()):

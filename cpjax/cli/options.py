@@ -41,6 +41,8 @@ class Option:
     choices: Sequence[str] | None = None
     count: int | None = None
     flag: str | None = None
+    numbers: bool = False
+    """Whether a file may give a text as a number."""
 
     @property
     def name(self) -> str:
@@ -78,7 +80,7 @@ CONTROLLER_OPTIONS = [
     ),
     Option("controller", "Q", "LQR for the plant: diagonal of the state weight", float, count=4, flag="q"),
     Option("controller", "R", "and the weight of the voltage (default the paper's 1e-4)", float, flag="r"),
-    Option("controller", "poles", "placement for the plant: poles, such as -3 -4 -5+2j -5-2j", count=4),
+    Option("controller", "poles", "placement for the plant: poles, such as -3 -4 -5+2j -5-2j", count=4, numbers=True),
     Option("controller", "K", "the regulator's gain itself, instead of all these", float, count=4, flag="gain"),
     *_numbers_of("controller", EnergySwingUp),
     Option(
@@ -172,6 +174,8 @@ def _checked_value(field: str, value: Any, option: Option) -> Any:
     several = option.count is not None
     if several and not (isinstance(value, list) and len(value) == option.count):
         raise InputError(field, value, f"a list of {option.count} values")
+    if option.numbers:
+        value = [str(v) if isinstance(v, (int, float)) and not isinstance(v, bool) else v for v in value]
     for one in value if several else [value]:
         if isinstance(one, bool) or not isinstance(one, python_types):
             raise InputError(field, value, words)
@@ -227,21 +231,25 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
 
 def _build_regulator(changes: dict[str, Any], plant: CartPole, reference: State) -> StateFeedback:
     given = {key: changes.pop(key) for key in ("K", "design", "gains", "Q", "R", "poles") if key in changes}
-    weights: dict[str, Any] = {key: given[key] for key in ("Q", "R") if key in given}
-    K, poles = given.get("K"), given.get("poles")
-    if K is not None:
+    if changes.get("gate") == "lyapunov" and ("K" in given or "poles" in given):
+        given = {key: value for key, value in given.items() if key not in ("Q", "R")}  # they are the gate's
+    for alone in ("K", "poles"):
+        others = [key for key in given if key not in (alone, "design", "gains")]
+        if alone in given and others:
+            raise InputError(others[0], given[others[0]], f"absent where {'gain' if alone == 'K' else alone} is given")
+    if "K" in given:
         if len(given) > 1:
-            raise InputError("gain", K, "absent where " + " or ".join(k for k in given if k != "K") + " is given")
-        return StateFeedback(K, reference)
-    if poles is not None or weights:
-        design = "placement" if poles is not None else "lqr"
-        asked = given.get("design", design)
-        if asked != design or (poles is not None and weights):
-            raise InputError("design", asked, "placement with poles, or lqr with Q and R")
+            raise InputError("gain", given["K"], "absent where design or gains is given")
+        return StateFeedback(given["K"], reference)
+    weights: dict[str, Any] = {key: given[key] for key in ("Q", "R") if key in given}
+    if "poles" in given or weights:
+        design, inputs = ("placement", "poles") if "poles" in given else ("lqr", "weights")
+        if given.get("design", design) != design:
+            raise InputError("design", given["design"], f"{design}, where {inputs} are given")
         if given.get("gains", "computed") != "computed":
-            raise InputError("gains", given["gains"], "computed, where poles or weights are given")
-        if poles is not None:
-            K = _designed("gain", plant, lambda A, B: place(A, B, parse_poles(poles)))
+            raise InputError("gains", given["gains"], f"computed, where {inputs} are given")
+        if "poles" in given:
+            K = _designed("gain", plant, lambda A, B: place(A, B, parse_poles(given["poles"])))
         else:
             K = _designed("gain", plant, lambda A, B: lqr(A, B, *_weights(weights)).K)
         return StateFeedback(K, reference)
@@ -255,7 +263,7 @@ def _designed(what: str, plant: CartPole, design: Callable[[Any, Any], Any]) -> 
     try:
         return design(*linearize(plant))
     except InputError as problem:
-        if problem.field not in ("A", "B", "Q"):
+        if problem.field not in ("A", "B"):
             raise
         raise InputError("plant", plant, f"one for which this {what} can be computed ({problem})") from problem
 

@@ -13,6 +13,6 @@ def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]
         table.add_column(name, justify="left" if i < text_columns else "right", overflow="fold")
     for row in rows:
         table.add_row(*row)
-    console = Console()
     # Where the width is not known (a file, a pipe) lines are as long as they need to be.
-    Console(width=200).print(table) if not console.is_terminal else console.print(table)
+    console = Console() if Console().is_terminal else Console(width=200)
+    console.print(table)

@@ -10,8 +10,8 @@ import numpy as np
 from cpjax.errors import InputError
 from cpjax.pytree import Array, is_traced
 
-MatrixLike: TypeAlias = Array | Sequence[Sequence[float]] | Sequence[float]
-"""A matrix as an array or as a nested list; a plain list where one column is meant."""
+MatrixLike: TypeAlias = Array | Sequence[Sequence[float]] | Sequence[float] | float
+"""A matrix as an array or a nested list; where one input is meant, as a plain list, or a number for 1 x 1."""
 
 
 def matrices(**given: Any) -> list[jax.Array]:
@@ -23,28 +23,30 @@ def matrices(**given: Any) -> list[jax.Array]:
       InputError: not real numbers, or a concrete one that is not finite.
     """
     allowed = "an array of finite real numbers"
-    arrays = {}
+    arrays, dtypes = {}, []
     for name, value in given.items():
-        if not hasattr(value, "dtype"):
-            if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
-                value = jnp.asarray(value)
-            else:
-                try:
-                    value = np.asarray(value)
-                except ValueError as problem:  # an uneven nesting
-                    raise InputError(name, value, allowed) from problem
-                if value.dtype.kind not in "fiu":
-                    raise InputError(name, given[name], allowed)
-                value = value.astype(np.int64) if value.dtype.kind in "iu" else value.tolist()
-        if not jnp.issubdtype(getattr(value, "dtype", float), jnp.number) or jnp.iscomplexobj(value):
+        array: Any
+        if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
+            array = jnp.asarray(value)
+        elif hasattr(value, "dtype"):
+            array = value
+        else:
+            try:
+                array = np.asarray(value)
+            except ValueError as problem:  # an uneven nesting
+                raise InputError(name, value, allowed) from problem
+        kind = array.dtype
+        if not jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.complexfloating):
             raise InputError(name, value, allowed)
-        arrays[name] = value
-    dtypes = [jax.dtypes.canonicalize_dtype(a.dtype) for a in arrays.values() if hasattr(a, "dtype")]
-    widest = [d for d in dtypes if jnp.issubdtype(d, jnp.floating)]
-    dtype = np.result_type(*widest) if widest else jnp.result_type(float)
+        if hasattr(value, "dtype") and jnp.issubdtype(kind, jnp.floating):
+            dtypes.append(jax.dtypes.canonicalize_dtype(kind))
+        # Whole numbers of any size, before they could wrap around in JAX's own.
+        whole = not is_traced(array) and jnp.issubdtype(kind, jnp.integer)
+        arrays[name] = np.asarray(array, dtype=np.float64) if whole else array
+    dtype = np.result_type(*dtypes) if dtypes else jnp.result_type(float)
     if dtype not in (jnp.float32, jnp.float64):
         raise InputError(next(iter(given)), f"array of dtype {dtype}", "of dtype float32 or float64")
-    converted = {name: jnp.asarray(value).astype(dtype) for name, value in arrays.items()}
+    converted = {name: jnp.asarray(array).astype(dtype) for name, array in arrays.items()}
     for name, array in converted.items():
         if not is_traced(array) and not np.all(np.isfinite(array)):
             raise InputError(name, given[name], allowed)
@@ -71,6 +73,19 @@ def shaped(name: str, matrix: jax.Array, shape: tuple[int, ...]) -> None:
     """
     if matrix.shape != shape:
         raise InputError(name, f"array of shape {matrix.shape}", f"of shape {shape}; batches go through jax.vmap")
+
+
+def columns(name: str, matrix: jax.Array, n: int) -> jax.Array:
+    """The inputs' matrix as (n, m), m at least 1; a plain vector (n,) is welcome for one input.
+
+    Raises:
+      InputError: another shape.
+    """
+    if matrix.shape == (n,):
+        return matrix[:, None]
+    if matrix.ndim != 2 or matrix.shape[0] != n or matrix.shape[1] == 0:
+        raise InputError(name, f"array of shape {matrix.shape}", f"of shape ({n}, m); batches go through jax.vmap")
+    return matrix
 
 
 def column(name: str, matrix: jax.Array, n: int) -> jax.Array:

@@ -28,7 +28,7 @@ def demanded_voltage(K: MatrixLike, angle: Scalar) -> jax.Array:
     """|u| [V] that the gain K (1, 4) asks for at rest, cart in place, `angle` [rad] from upright."""
     (K,) = matrices(K=K)
     shaped("K", K, (1, 4))
-    return jnp.abs(K[0, _THETA]) * jnp.asarray(angle, dtype=K.dtype)
+    return jnp.abs(K[0, _THETA] * jnp.asarray(angle, dtype=K.dtype))
 
 
 def saturation_angle(K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
@@ -90,40 +90,43 @@ def level_within_angle_and_rate(P: MatrixLike, half_angle: Scalar, rate: Scalar)
     P = _positive_definite("P", P, 4)
     half_angle = _limit("half_angle", "rad", half_angle, P, at_most=math.pi)
     rate = _limit("rate", "rad/s", rate, P)
-    shadow = _spread(P, (_THETA, _RATE))
+    return _touching_level(_spread(P, (_THETA, _RATE)), half_angle, rate)
 
-    form = linear_solve(shadow, jnp.eye(2, dtype=P.dtype))
-    half_edge, half_cos = jnp.sin(0.5 * half_angle), jnp.cos(0.5 * half_angle)
-    # Positions are angles in the plane in which the level set's shadow is about as wide as it is high: however far
-    # apart angle and rate are in size, the level changes over no small part of a turn.
-    spread = jnp.sqrt(jnp.diagonal(shadow))
-    ratio = lax.stop_gradient(half_angle * spread[1] / (rate * spread[0]))
 
-    def level(position: jax.Array) -> jax.Array:
-        """At a point of the gate's boundary, half of which is passed as `position` goes from 0 to pi."""
+@jax.jit
+def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -> jax.Array:
+    """The level at which the level set's shadow (2, 2) on angle and rate touches the gate's boundary."""
+    gate = jnp.linalg.inv(shadow), half_angle, rate
+    fixed = lax.stop_gradient(gate)
+    # Positions are angles in the plane in which the shadow is about as wide as it is high: however far apart angle and
+    # rate are in size, the level changes over no small part of a turn.
+    ratio = lax.stop_gradient(half_angle * jnp.sqrt(shadow[1, 1]) / (rate * jnp.sqrt(shadow[0, 0])))
+
+    def level(position: jax.Array, form: jax.Array, half_angle: jax.Array, rate: jax.Array) -> jax.Array:
+        """At a point of the boundary, half of which is passed as `position` goes from 0 to pi."""
         sin, cos = jnp.sin(position), ratio * jnp.cos(position)
-        sin, cos = jnp.stack([sin, cos]) / jnp.hypot(sin, cos)
+        length = jnp.hypot(sin, cos)
+        sin, cos = sin / length, cos / length
+        half_edge, half_cos = jnp.sin(0.5 * half_angle), jnp.cos(0.5 * half_angle)
         angle = 2.0 * jnp.arctan2(half_edge * sin, jnp.hypot(half_cos, half_edge * cos))
         point = jnp.stack([angle, rate * cos])
         return point @ form @ point
 
-    # The level set's shadow touches the boundary where the level is smallest. A half angle near pi gives the boundary
-    # two corners, so the search narrows down before Newton's method refines it.
-    width = 0.5 * math.pi
-    position = jnp.asarray(width, dtype=P.dtype)
-    for points in (257, 65, 65):
-        positions = position + width * jnp.linspace(-1.0, 1.0, points, dtype=P.dtype)
-        position = positions[jnp.argmin(jax.vmap(level)(positions))]
-        width = 2.0 * width / (points - 1)
-    slope, curvature = jax.grad(level), jax.grad(jax.grad(level))
-    for _ in range(2):
-        step = jnp.clip(jnp.nan_to_num(slope(position) / curvature(position)), -width, width)
-        position = jnp.where(level(position - step) < level(position), position - step, position)
-    position = lax.stop_gradient(position)
+    def narrowed(_: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        middle, width = carry
+        positions = middle + width * jnp.linspace(-1.0, 1.0, 129, dtype=shadow.dtype)
+        return positions[jnp.argmin(jax.vmap(lambda position: level(position, *fixed))(positions))], width / 64.0
+
+    # The shadow touches the boundary where the level is smallest. A search on grids that narrow down copes with the
+    # corner that a half angle near pi gives the boundary.
+    quarter = jnp.asarray(0.5 * math.pi, dtype=shadow.dtype)
+    position, _ = lax.fori_loop(0, 5, narrowed, (quarter, quarter))
     # By the envelope theorem the minimum's derivative is that at a fixed position. For the second one, the position
-    # moves as one more step of Newton's moves it; where the level is the same everywhere, it need not.
-    bend = lax.stop_gradient(curvature(position))
-    return level(position - jnp.where(bend > 0.0, slope(position) / jnp.where(bend > 0.0, bend, 1.0), 0.0))
+    # moves as a step of Newton's method moves it; where the level is the same everywhere, it need not.
+    slope = jax.grad(level)
+    bend = jax.grad(slope)(position, *fixed)
+    step = slope(position, *gate) / jnp.where(bend > 0.0, bend, 1.0)
+    return level(position - jnp.where(bend > 0.0, step, 0.0), *gate)
 
 
 def level_within_form(P: MatrixLike, other: MatrixLike, level: Scalar) -> jax.Array:
@@ -149,12 +152,15 @@ def _spread(P: jax.Array, chosen: tuple[int, ...]) -> jax.Array:
     return columns.T @ linear_solve(P, columns)
 
 
+_is_positive_definite = jax.jit(is_positive_definite)
+
+
 def _positive_definite(name: str, P: jax.Array, size: int | None = None) -> jax.Array:
     """The symmetric part of a positive definite matrix; NaN for another that is traced."""
     n = square(name, P)
     shaped(name, P, (size or n,) * 2)
     P = 0.5 * (P + P.T)
-    definite = is_positive_definite(lax.stop_gradient(P))
+    definite = _is_positive_definite(lax.stop_gradient(P))
     if not is_traced(definite) and not definite:
         raise InputError(name, P, "positive definite, by a margin that rounding leaves visible")
     return jnp.where(definite, P, jnp.nan)

@@ -24,9 +24,9 @@ def lqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLik
 
     Args:
       A: (n, n).
-      B: (n, m).
+      B: (n, m), or (n,) for one input.
       Q: (n, n), symmetric, positive semidefinite.
-      R: (m, m), symmetric, positive definite.
+      R: (m, m), symmetric, positive definite; or a number for one input.
       N: (n, m); zero if left out.
 
     Raises:

@@ -130,6 +130,8 @@ class QuadraticFactors(NamedTuple):
         Raises:
           InputError: poles that are not closed under conjugation, or not all in the open left half plane.
         """
+        if any(is_traced(p) for p in jax.tree.leaves(poles)):
+            raise InputError("poles", poles, "known numbers, outside jit and vmap")
         polynomial_from_poles(poles)
         numbers = np.asarray(poles, dtype=np.complex128)
         if not np.all(numbers.real < 0.0):
@@ -137,6 +139,8 @@ class QuadraticFactors(NamedTuple):
         small = 1e-9 * np.abs(numbers)
         upper = numbers[numbers.imag > small]
         real = np.sort(-numbers[np.abs(numbers.imag) <= small].real)
+        if 2 * len(upper) + len(real) != len(numbers):
+            raise InputError("poles", poles, "closed under conjugation: complex ones in pairs")
         first, second = real[0 : len(real) // 2 * 2 : 2], real[1::2]
         a = np.concatenate([-2.0 * upper.real, first + second])
         b = np.concatenate([np.abs(upper) ** 2, first * second])

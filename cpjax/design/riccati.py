@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from cpjax.design.arguments import MatrixLike, matrices, shaped, square
+from cpjax.design.arguments import MatrixLike, columns, matrices, shaped, square
 from cpjax.design.lyapunov import Sum, cayley_shift, lyapunov_equation, stein_equation, sum_continuous, sum_discrete
 from cpjax.errors import InputError
 from cpjax.numeric import double_word as dw
@@ -82,9 +82,9 @@ def solve_care(
 
     Args:
       A: (n, n).
-      B: (n, m).
+      B: (n, m), or (n,) for one input.
       Q: (n, n), symmetric, positive semidefinite.
-      R: (m, m), symmetric, positive definite.
+      R: (m, m), symmetric, positive definite; or a number for one input.
       N: (n, m), such that [[Q, N], [N', R]] is positive semidefinite; zero if left out.
 
     Raises:
@@ -108,23 +108,25 @@ def _solved(
     given = {"A": A, "B": B, "Q": Q, "R": R} | ({} if N is None else {"N": N})
     A, B, Q, R, *cross = matrices(**given)
     n = square("A", A)
-    if B.ndim != 2 or B.shape[0] != n or B.shape[1] == 0:
-        raise InputError("B", f"array of shape {B.shape}", f"of shape ({n}, m); batches go through jax.vmap")
+    B = columns("B", B, n)
     m = B.shape[1]
     shaped("Q", Q, (n, n))
+    R = R.reshape(1, 1) if R.shape == () else R
     shaped("R", R, (m, m))
-    N = cross[0] if cross else jnp.zeros((n, m), dtype=A.dtype)
+    N = columns("N", cross[0], n) if cross else jnp.zeros((n, m), dtype=A.dtype)
     shaped("N", N, (n, m))
     problem = (A, B, Q, R, N)
     concrete = not any(is_traced(x) for x in problem)
     if concrete:
-        _check_weights(*(np.asarray(x, dtype=np.float64) for x in (Q, R, N)))
-        _check_modes(time, *(np.asarray(x, dtype=np.float64) for x in problem), room=32.0 * n * np.finfo(A.dtype).eps)
+        room = 16.0 * n * float(np.finfo(A.dtype).eps)
+        _check_weights(*(np.asarray(x, dtype=np.float64) for x in (Q, R, N)), room=room)
     P, K = equation(A, B, 0.5 * (Q + Q.T), 0.5 * (R + R.T), N)
     found = jnp.all(jnp.isfinite(P))
     if concrete and not found:
-        _check_modes(time, *(np.asarray(x, dtype=np.float64) for x in problem), room=np.sqrt(np.finfo(A.dtype).eps))
-        raise InputError("Q", Q, f"better conditioned with A, B and R: in {A.dtype}, rounding hides the solution")
+        _check_modes(
+            time, *(np.asarray(x, dtype=np.float64) for x in problem), room=float(np.finfo(A.dtype).eps) ** 0.5
+        )
+        raise InputError("A", A, f"better conditioned with B, Q and R: in {A.dtype}, rounding hides the solution")
     return RiccatiSolution(P, K, found)
 
 
@@ -335,7 +337,7 @@ def _discrete_jvp(primals: Problem, tangents: Problem) -> tuple[Any, Any]:
 _Numbers: TypeAlias = np.ndarray[Any, Any]
 
 
-def _check_weights(Q: _Numbers, R: _Numbers, N: _Numbers) -> None:
+def _check_weights(Q: _Numbers, R: _Numbers, N: _Numbers, *, room: float) -> None:
     for name, weight in (("Q", Q), ("R", R)):
         if np.max(np.abs(weight - weight.T)) > 1e-6 * np.max(np.abs(weight)):
             raise InputError(name, weight, "a symmetric matrix")
@@ -344,10 +346,10 @@ def _check_weights(Q: _Numbers, R: _Numbers, N: _Numbers) -> None:
     joint = np.block([[Q, N], [N.T, R]]) if np.any(N) else Q
     size = np.sqrt(np.abs(np.diag(joint)))
     size[size == 0.0] = 1.0
-    if not np.min(np.linalg.eigvalsh(joint / np.outer(size, size))) > -1e-6:
+    if not np.min(np.linalg.eigvalsh(joint / np.outer(size, size))) >= -room:
         if np.any(N):
-            raise InputError("N", N, "such that [[Q, N], [N', R]] is positive semidefinite")
-        raise InputError("Q", Q, "positive semidefinite")
+            raise InputError("N", N, "such that [[Q, N], [N', R]] is positive semidefinite, to rounding")
+        raise InputError("Q", Q, "positive semidefinite, to rounding")
 
 
 def _check_modes(time: str, A: _Numbers, B: _Numbers, Q: _Numbers, R: _Numbers, N: _Numbers, *, room: float) -> None:

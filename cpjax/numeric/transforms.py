@@ -4,6 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cpjax.errors import InputError
+from cpjax.pytree import is_traced
+
 
 def positive(x: jax.Array) -> jax.Array:
     """exp(x), element by element: a step in x is a relative change of the positive number, whatever its unit."""
@@ -17,16 +20,35 @@ def from_positive(y: jax.Array) -> jax.Array:
 
 def semidefinite(x: jax.Array) -> jax.Array:
     """L L' (n, n) with the lower triangle L filled with x (n (n + 1) / 2,), row by row: any symmetric, positive
-    semidefinite matrix, singular ones included. Not one to one: a column of L may change its sign.
+    semidefinite matrix, singular ones included.
+
+    Not one to one: a column of L may change its sign. Along a column of zeros the derivative is zero: an optimiser that
+    starts there stays there.
+
+    Raises:
+      InputError: numbers that fill no triangle.
     """
-    n = _triangle(x.shape[0])
+    x = jnp.asarray(x)
+    n = int(((8 * x.size + 1) ** 0.5 - 1) / 2)
+    if x.ndim != 1 or n == 0 or n * (n + 1) // 2 != x.size:
+        raise InputError("x", f"array of shape {x.shape}", "of shape (n (n + 1) / 2,): the rows of a triangle")
     L = jnp.zeros((n, n), dtype=x.dtype).at[jnp.tril_indices(n)].set(x)
     return L @ L.T
 
 
 def from_semidefinite(Q: jax.Array) -> jax.Array:
-    """An x of which `semidefinite` makes Q: the Cholesky factor, with a column of zeros where its pivot vanishes."""
+    """An x of which `semidefinite` makes Q (n, n): the Cholesky factor, with zeros where a pivot vanishes.
+
+    Raises:
+      InputError: a concrete Q that is not symmetric and positive semidefinite. Under jit x means nothing then.
+    """
+    Q = jnp.asarray(Q)
     n = Q.shape[0]
+    if not is_traced(Q):
+        numbers = np.asarray(Q, dtype=np.float64)
+        room = 16.0 * n * float(np.finfo(Q.dtype).eps) * np.max(np.abs(numbers), initial=0.0)
+        if not np.max(np.abs(numbers - numbers.T)) <= room or not np.min(np.linalg.eigvalsh(numbers)) >= -room:
+            raise InputError("Q", Q, "symmetric and positive semidefinite")
     # A pivot that is only rounding would be divided by; relative to its diagonal element it counts as zero.
     room = 8.0 * n * np.finfo(Q.dtype).eps * jnp.diagonal(Q)
     rest, columns = Q, []
@@ -38,10 +60,3 @@ def from_semidefinite(Q: jax.Array) -> jax.Array:
         rest = rest - column[:, None] * column[None]
         columns.append(column)
     return jnp.stack(columns, axis=1)[jnp.tril_indices(n)]
-
-
-def _triangle(size: int) -> int:
-    n = int(((8 * size + 1) ** 0.5 - 1) / 2)
-    if n * (n + 1) // 2 != size:
-        raise ValueError(f"{size} numbers fill no triangle")
-    return n

@@ -11,7 +11,7 @@ from cpjax.controllers import SWING_UP
 from cpjax.controllers.gates import Gate
 from cpjax.design.structure import Structure
 from cpjax.show.figures import DESIGN_NAMES
-from cpjax.state import NAMES, UNITS, State
+from cpjax.state import NAMES, UNITS, UPRIGHT, State
 from cpjax.study.design_check import DesignCheck
 
 _INK, _CLIP, _GATE = "#0072B2", "#D55E00", "#009E73"
@@ -88,20 +88,23 @@ def picture(check: DesignCheck, gate: Gate, voltage_limit: float, title: str) ->
 
 def _plane(axes: Axes, check: DesignCheck, gate: Gate, voltage_limit: float) -> None:
     K, widest = check.K[0], min(1.3 * check.gate_angle, math.pi)
-    tallest = max(1.3 * voltage_limit / abs(K[3]) if K[3] else 0.0, 3.0 * widest)
+    limited = math.isfinite(voltage_limit)
+    tallest = max(1.3 * voltage_limit / abs(K[3]) if K[3] and limited else 0.0, 3.0 * widest)
     theta, rate = np.meshgrid(np.linspace(-widest, widest, 301), np.linspace(-tallest, tallest, 301))
     zero = np.zeros_like(theta)
-    margin = np.asarray(gate.margin(State(zero, zero, theta, rate), jnp.full(theta.shape, SWING_UP)))
+    x = zero + float(getattr(gate, "reference", UPRIGHT).x)
+    margin = np.asarray(gate.margin(State(x, zero, theta, rate), jnp.full(theta.shape, SWING_UP)))
     degrees = np.degrees(theta)
     axes.contour(degrees, rate, margin, levels=[0.0], colors=_GATE)
     demand = np.abs(K[2] * theta + K[3] * rate)
-    axes.contourf(degrees, rate, demand, levels=[0.0, voltage_limit], colors=[_CLIP], alpha=0.25)
+    if limited:
+        axes.contourf(degrees, rate, demand, levels=[0.0, voltage_limit], colors=[_CLIP], alpha=0.25)
+        axes.fill_between([], [], color=_CLIP, alpha=0.25, label=f"asks for at most {voltage_limit:g} V")
     if check.P is not None and check.level is not None:
         block = check.P[2:, 2:]
         form = block[0, 0] * theta**2 + 2 * block[0, 1] * theta * rate + block[1, 1] * rate**2
         axes.contourf(degrees, rate, form, levels=[0.0, check.level], colors=[_INK], alpha=0.7)
     axes.plot([], [], color=_GATE, label="gate")
-    axes.fill_between([], [], color=_CLIP, alpha=0.25, label=f"asks for at most {voltage_limit:g} V")
     axes.fill_between([], [], color=_INK, alpha=0.7, label="certified level set")
     axes.set_xlabel(r"$\theta$ [deg]")
     axes.set_ylabel(r"$\dot\theta$ [rad/s]")

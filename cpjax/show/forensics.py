@@ -61,7 +61,7 @@ def findings(audit: GainAudit) -> list[str]:
         best, good = audit.best(size), sum(fit.explains for fit in fits)
         kind = "Single parameters" if size == 1 else f"Sets of {size} parameters"
         sentences.append(
-            f"{kind}: {good or 'none'} of {len(fits)} may change and explain every gain. The best, "
+            f"{kind} that may change: {good or 'none'} of {len(fits)} explain every gain. The best, "
             f"{' and '.join(best.parameters)}, leaves {best.worst:.3g} units"
             + (" (rounding alone leaves up to 0.5)." if good else ".")
         )
@@ -70,7 +70,7 @@ def findings(audit: GainAudit) -> list[str]:
     sentences.append(
         f"About the plant found: of {len(audit.directions)} independent combinations of parameters, the gains fix "
         f"{len(known)} to better than 10 %"
-        + (f" (the last of them to {100 * known[-1].known_to:.2g} %)" if known else "")
+        + (f" (the least known of them to {100 * known[-1].known_to:.2g} %)" if known else "")
         + f", {len(audit.directions) - len(known) - unknown} less well and {unknown} not at all."
     )
     return sentences

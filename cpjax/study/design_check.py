@@ -74,6 +74,10 @@ def check_design(plant: CartPole, regulator: StateFeedback, gate: Gate) -> Desig
         reference = getattr(part, "reference", None)
         if reference is not None and any(float(getattr(reference, n)) for n in NAMES if n != "x"):
             raise InputError(f"{name}.reference", reference, "upright at rest, wherever the cart is")
+    if isinstance(gate, LyapunovGate) and float(gate.reference.x) != float(regulator.reference.x):
+        raise InputError("gate.reference.x", gate.reference.x, f"the regulator's, {regulator.reference.x} m")
+    if isinstance(gate, LyapunovGate) and not np.min(np.linalg.eigvalsh(np.asarray(gate.P))) > 0.0:
+        raise InputError("gate.P", gate.P, "positive definite")
     A, B = linearize(plant)
     K = jnp.asarray(regulator.K, dtype=A.dtype)
     limit = plant.motor.voltage_limit

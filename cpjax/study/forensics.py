@@ -8,7 +8,6 @@ leaves at most 0.5.
 """
 
 import dataclasses
-import functools
 import itertools
 import math
 import re
@@ -144,7 +143,8 @@ class Direction:
 
     Attributes:
       sensitivity: singular value: units of the last digit by which the gains move, for a relative change by 1.
-      weights: the relative change of each parameter, by name; their squares sum to 1.
+      weights: the relative change of each parameter, by name; their squares sum to 1. Of one that is zero in the
+        plant, the change relative to a size typical of the plant.
     """
 
     sensitivity: float
@@ -217,8 +217,8 @@ def audit_gains(
     if not isinstance(plant, CartPole):
         raise InputError("plant", plant, "a cpjax.CartPole")
     check("plant", plant)
-    if not prints:
-        raise InputError("prints", prints, "one printed gain or more")
+    if not isinstance(prints, Sequence) or not prints or not all(isinstance(p, PrintedGain) for p in prints):
+        raise InputError("prints", prints, "a list of one PrintedGain or more")
     unknown = [name for name in parameters if name not in PARAMETERS]
     if unknown or len(set(parameters)) < len(parameters) or not parameters:
         raise InputError("parameters", unknown or parameters, "different ones of " + ", ".join(PARAMETERS))
@@ -228,13 +228,13 @@ def audit_gains(
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise InputError("seed", seed, "a whole number, at least 0")
     names, given = tuple(parameters), tuple(prints)
-    unchanged, _ = _linearised(given, plant, names)
+    unchanged, _ = _linearised(given, plant)
     for printed, rest in zip(given, unchanged.reshape(-1, 4), strict=True):
         if not np.all(np.isfinite(rest)):
             allowed = "of a design for which the plant, before any change, has a gain"
             raise InputError(f"{printed.design} gain", printed.gain, allowed)
-    sets = [chosen for size in range(1, most + 1) for chosen in itertools.combinations(range(len(names)), size)]
-    fits = _fit_all(given, plant, names, sets, _random_starts(sets, most, starts, seed), progress)
+    sets = [chosen for size in range(1, most + 1) for chosen in itertools.combinations(names, size)]
+    fits = _fit_all(given, plant, sets, _random_starts(sets, most, starts, seed), progress)
     if progress is not None:
         progress(len(sets), len(sets), "singular values")
     audit = GainAudit(tuple(unchanged.tolist()), tuple(fits), (), plant)
@@ -338,21 +338,29 @@ def _with_derivatives(
     return r, J
 
 
-def _linearised(prints: tuple[PrintedGain, ...], plant: CartPole, names: tuple[str, ...]) -> tuple[Any, Any]:
-    """Residuals on `plant`, and their derivatives by the named parameters, as NumPy arrays."""
-    numbers = jnp.asarray([_value(plant, name) for name in names])
-    r, J = _compiled_linearisation(prints, cast(plant, numbers.dtype), names, numbers)
+# Compiled for all parameters, whichever are asked for: one program serves every audit of as many gains.
+
+
+def _linearised(prints: tuple[PrintedGain, ...], plant: CartPole) -> tuple[Any, Any]:
+    """Residuals on `plant`, and their derivatives by all `PARAMETERS`, as NumPy arrays."""
+    r, J = _compiled_linearisation(prints, *_numbers(plant))
     return np.asarray(r), np.asarray(J)
 
 
-@functools.partial(jax.jit, static_argnames="names")
+@jax.jit
 def _compiled_linearisation(
-    prints: tuple[PrintedGain, ...], plant: CartPole, names: tuple[str, ...], numbers: jax.Array
+    prints: tuple[PrintedGain, ...], plant: CartPole, numbers: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    return _with_derivatives(prints, plant, lambda x: dict(zip(names, x, strict=True)), numbers)
+    return _with_derivatives(prints, plant, lambda x: dict(zip(PARAMETERS, x, strict=True)), numbers)
 
 
-def _random_starts(sets: Sequence[tuple[int, ...]], most: int, count: int, seed: int) -> np.ndarray[Any, Any]:
+def _numbers(plant: CartPole) -> tuple[CartPole, jax.Array]:
+    """The plant with arrays for numbers, and the values of all `PARAMETERS`, of one dtype."""
+    numbers = jnp.asarray([_value(plant, name) for name in PARAMETERS])
+    return cast(plant, numbers.dtype), numbers
+
+
+def _random_starts(sets: Sequence[tuple[str, ...]], most: int, count: int, seed: int) -> np.ndarray[Any, Any]:
     """Logarithms of factors (sets, count, most); those beyond a set's size are not used."""
     generator, spread = np.random.default_rng(seed), math.log(_START_FACTOR)
     return generator.uniform(-spread, spread, (len(sets), count, most))
@@ -361,18 +369,16 @@ def _random_starts(sets: Sequence[tuple[int, ...]], most: int, count: int, seed:
 def _fit_all(
     prints: tuple[PrintedGain, ...],
     plant: CartPole,
-    names: tuple[str, ...],
-    sets: Sequence[tuple[int, ...]],
+    sets: Sequence[tuple[str, ...]],
     starts: np.ndarray[Any, Any],
     progress: Progress | None,
 ) -> list[Fit]:
     """The best of all starts (sets, count, most) for each set of parameters."""
     count, most = starts.shape[1:]
     # Sets of any size in one program: an index beyond the last parameter stands for one less.
-    padded = np.array([chosen + (len(names),) * (most - len(chosen)) for chosen in sets])
+    padded = [[*map(PARAMETERS.index, names), *[len(PARAMETERS)] * (most - len(names))] for names in sets]
     chosen, x = np.repeat(padded, count, axis=0), starts.reshape(-1, most)
-    own = jnp.asarray([_value(plant, name) for name in names])
-    base = jnp.asarray([_scale(plant, name) for name in names])
+    base = jnp.asarray([_scale(plant, name) for name in PARAMETERS])
     lanes = min(_LANES, len(x))
     ends = []
     for first in range(0, len(x), lanes):
@@ -380,18 +386,18 @@ def _fit_all(
             text = f"sets of up to {most} parameters, {count} starts each"
             progress(first // count, len(sets), text)
         now = np.arange(first, first + lanes) % len(x)  # what the last round has too much is dropped below
-        ends.append(_fitted(prints, cast(plant, own.dtype), names, own, base, chosen[now], jnp.asarray(x[now])))
+        ends.append(_fitted(prints, *_numbers(plant), base, chosen[now], jnp.asarray(x[now])))
     found, rest = (np.concatenate(a)[: len(x)].reshape(len(sets), count, -1) for a in zip(*ends, strict=True))
     cost = np.sum(rest**2, axis=-1)
     fits = []
-    for row, members in enumerate(sets):
+    for row, names in enumerate(sets):
         best = int(np.argmin(cost[row]))
         lowest = cost[row, best]
         agree = cost[row] <= lowest + max(0.01 * lowest, 0.01)
         fits.append(
             Fit(
-                tuple(names[i] for i in members),
-                tuple(found[row, best, : len(members)].tolist()),
+                names,
+                tuple(found[row, best, : len(names)].tolist()),
                 tuple(rest[row, best].tolist()),
                 float(np.mean(agree & np.isfinite(cost[row]))),
             )
@@ -399,11 +405,10 @@ def _fit_all(
     return fits
 
 
-@functools.partial(jax.jit, static_argnames="names")
+@jax.jit
 def _fitted(
     prints: tuple[PrintedGain, ...],
     plant: CartPole,
-    names: tuple[str, ...],
     own: jax.Array,
     base: jax.Array,
     chosen: jax.Array,
@@ -412,9 +417,9 @@ def _fitted(
     """The chosen parameters (lanes, most) and the residuals (lanes, 4 gains) where each start ends.
 
     Args:
-      own: (names,) values of the parameters that are not chosen.
-      base: (names,) what the exponentials of `starts` are factors of.
-      chosen: (lanes, most) indices into `names`, or their number for none.
+      own: (parameters,) values of those that are not chosen.
+      base: (parameters,) what the exponentials of `starts` are factors of.
+      chosen: (lanes, most) indices into `PARAMETERS`, or their number for none.
       starts: (lanes, most).
     """
     own, base = jnp.append(own, 1.0), jnp.append(base, 1.0)
@@ -422,7 +427,7 @@ def _fitted(
     def one(chosen: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
         def values(x: jax.Array) -> dict[str, jax.Array]:
             numbers = own.at[chosen].set(base[chosen] * jnp.exp(x))
-            return dict(zip(names, numbers[:-1], strict=True))
+            return dict(zip(PARAMETERS, numbers[:-1], strict=True))
 
         end, rest = _least_squares(lambda x: _with_derivatives(prints, plant, values, x), x, 4 * len(prints))
         return base[chosen] * jnp.exp(end), rest
@@ -464,8 +469,9 @@ def _least_squares(
 
 def _directions(prints: tuple[PrintedGain, ...], plant: CartPole, names: tuple[str, ...]) -> tuple[Direction, ...]:
     """Singular values and vectors of the gains' dependence on relative changes of all parameters, at `plant`."""
-    _, J = _linearised(prints, plant, names)
-    _, values, vectors = np.linalg.svd(J * [_scale(plant, name) for name in names], full_matrices=True)
+    _, J = _linearised(prints, plant)
+    relative = J[:, [PARAMETERS.index(name) for name in names]] * [_scale(plant, name) for name in names]
+    _, values, vectors = np.linalg.svd(relative, full_matrices=True)
     values = np.concatenate([values, np.zeros(len(names))])[: len(names)]
     values = np.where(values < 1e-9 * values[0], 0.0, values)  # rounding
     return tuple(
