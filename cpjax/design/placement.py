@@ -6,9 +6,10 @@ It asks for a polynomial, not for poles, so that repeated ones are like any othe
 
 A derivative follows from the polynomial's own. With A_K = A - B K and adj(s I - A_K) = sum of s^(n-1-k) H_k,
 
-    dc_k = dK H_k B - tr(H_k (dA - dB K))
+    dc_k = dK H_k B - tr(H_k (dA - dB K)),    k = 0 .. n-1
 
-is a linear equation for dK, smooth through repeated poles as well.
+is a linear equation for dK, smooth through repeated poles as well. Its solution is written as two tables of
+sensitivities, which are again sums in which digits cancel and are made in double-word arithmetic.
 """
 
 from collections.abc import Sequence
@@ -71,7 +72,7 @@ def place_polynomial(A: MatrixLike, B: MatrixLike, coefficients: Array | Sequenc
     A, B, coefficients = matrices(A=A, B=B, coefficients=coefficients)
     n = square("A", A)
     shaped("coefficients", coefficients, (n,))
-    K = _gain(A, column("B", B, n), coefficients)
+    K, _, _ = _placement(A, column("B", B, n), coefficients)
     if not is_traced(K) and not np.all(np.isfinite(K)):
         raise InputError("B", B, "controllable with A, by a margin that rounding leaves visible")
     return K
@@ -86,9 +87,14 @@ def polynomial_from_poles(poles: Array | Sequence[complex]) -> jax.Array:
     """
     if not hasattr(poles, "dtype") and not any(is_traced(p) for p in jax.tree.leaves(poles)):
         try:
-            poles = np.asarray(poles, dtype=np.complex128)
-        except (TypeError, ValueError) as problem:
+            numbers = np.asarray(poles)
+            if numbers.dtype.kind not in "fiuc":
+                raise ValueError(f"dtype {numbers.dtype}")
+        except ValueError as problem:
             raise InputError("poles", poles, "a sequence of numbers") from problem
+        poles = numbers.astype(np.complex128)
+    if not jnp.issubdtype(getattr(poles, "dtype", complex), jnp.number):
+        raise InputError("poles", poles, "numbers")
     poles = jnp.asarray(poles)
     kind = jax.dtypes.canonicalize_dtype(poles.dtype)
     poles = poles.astype(kind if jnp.issubdtype(kind, jnp.inexact) else jnp.result_type(float))
@@ -169,56 +175,89 @@ class QuadraticFactors(NamedTuple):
     def poles(self) -> jax.Array:
         """The complex roots (n,), to read: they have no derivative where two of them meet [1/s]."""
         root = jnp.sqrt(lax.complex(self.a * self.a / 4 - self.b, jnp.zeros_like(self.a)))
-        half = (0.5 * self.a).astype(root.dtype)
-        return jnp.concatenate([root - half, -root - half, -self.c.astype(root.dtype)])
+        first = -root - (0.5 * self.a).astype(
+            root.dtype
+        )  # the larger one: in the other, a slow pole's digits would cancel
+        second = jnp.where(root.imag > 0.0, first.conj(), self.b.astype(root.dtype) / first)
+        return jnp.concatenate([second, first, -self.c.astype(root.dtype)])
 
 
-def _radius(coefficients: jax.Array) -> jax.Array:
-    """A size of the polynomial's roots, by which coefficient k is measured in units of its k-th power."""
-    powers = jnp.arange(1, coefficients.shape[0] + 1, dtype=coefficients.dtype)
-    powers = powers.reshape(powers.shape + (1,) * (coefficients.ndim - 1))
-    return jnp.max(jnp.abs(coefficients) ** (1.0 / powers), axis=0)
+class _Placement(NamedTuple):
+    """The gain, and how it answers to the coefficients and to the closed loop's matrix."""
+
+    K: Matrix
+    """Shape (1, n)."""
+    by_coefficient: Matrix
+    """dK_j / dc_k, shape (n, n): k, j."""
+    by_element: Matrix
+    """dK_j / d(A - B K)_ab with K held, shape (n, n, n): j, a, b."""
 
 
 @batch_last
 @jax.jit
-def _ackermann(A: Matrix, B: Matrix, coefficients: jax.Array) -> Matrix:
+def _ackermann(A: Matrix, B: Matrix, coefficients: jax.Array) -> _Placement:
     n = A.shape[0]
-    a, krylov = double_word(A), [double_word(B)]
+    a, b = double_word(A), double_word(B)
+    krylov = [b]
     for _ in range(n - 1):
         krylov.append(accurate_product(a, krylov[-1]))
-    controllability = DoubleWord(*(jnp.concatenate(x, axis=1) for x in zip(*krylov, strict=True)))
-    last = double_word(identity_like(A)[:, n - 1 :])
-    w = transpose(accurate_solve(transpose(controllability), last))
+    identity = double_word(identity_like(A))
+    last = DoubleWord(*(x[:, n - 1 :] for x in identity))
+    w = transpose(accurate_solve(transpose(_side_by_side(krylov)), last))
     K = w
     for k in range(n):
         K = dw.add(accurate_product(K, a), dw.multiply(w, double_word(coefficients[None, k : k + 1])))
-    # Rounding K must not move the poles visibly. Where the input hardly reaches a mode, K is large and what it does
-    # cancels: K B, the shift of the poles' sum, is then small beside its own terms.
-    terms = jnp.sum(jnp.abs(K.high[0] * B[:, 0]), axis=0)
-    room = 1e-3 / np.finfo(A.dtype).eps * (_radius(coefficients) + jnp.max(jnp.abs(A), axis=(0, 1)))
-    return jnp.where(terms < room, K.high, jnp.nan)
+
+    closed = dw.add(a, dw.negative(accurate_product(b, K)))
+    adjugates = [identity]
+    for k in range(n - 1):
+        constant = dw.multiply(identity, double_word(coefficients[None, k : k + 1]))
+        adjugates.append(dw.add(accurate_product(closed, adjugates[-1]), constant))
+    by_coefficient = accurate_solve(_side_by_side([accurate_product(H, b) for H in adjugates]), identity)
+    flat = DoubleWord(
+        *(
+            jnp.stack([x.reshape((n * n, *x.shape[2:])) for x in part])
+            for part in zip(*map(transpose, adjugates), strict=True)
+        )
+    )
+    by_element = accurate_product(transpose(by_coefficient), flat).high.reshape((n, n, n, *A.shape[2:]))
+
+    # Where the data's own rounding is what makes the pair controllable, it also decides about the gain.
+    gain = K.high[0]
+    size = jnp.abs(A) + jnp.abs(B * gain[None])
+    blur = np.finfo(A.dtype).eps * jnp.sum(jnp.abs(by_element) * size[None], axis=(1, 2))
+    found = jnp.all(blur <= 0.01 * jnp.max(jnp.abs(gain), axis=0), axis=0)
+    parts = K.high, by_coefficient.high, by_element
+    return _Placement(*(jnp.where(found, part, jnp.nan) for part in parts))
+
+
+def _side_by_side(columns: list[DoubleWord]) -> DoubleWord:
+    return DoubleWord(*(jnp.concatenate(part, axis=1) for part in zip(*columns, strict=True)))
+
+
+def _sensitivities(A: jax.Array, B: jax.Array, K: jax.Array, coefficients: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The two tables of `_Placement` in plain floats, for their derivatives."""
+    n = A.shape[0]
+    closed, identity = A - B @ K, jnp.eye(n, dtype=A.dtype)
+    adjugates = [identity]
+    for k in range(n - 1):
+        adjugates.append(closed @ adjugates[-1] + coefficients[k] * identity)
+    by_coefficient = linear_solve(jnp.concatenate([H @ B for H in adjugates], axis=1), identity)
+    return by_coefficient, jnp.einsum("kj,kba->jab", by_coefficient, jnp.stack(adjugates))
 
 
 @jax.custom_jvp
-def _gain(A: jax.Array, B: jax.Array, coefficients: jax.Array) -> jax.Array:
+def _placement(A: jax.Array, B: jax.Array, coefficients: jax.Array) -> _Placement:
     return _ackermann(A, B, coefficients)
 
 
-@_gain.defjvp
-def _gain_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
+@_placement.defjvp
+def _placement_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Placement, _Placement]:
     A, B, c = primals
     dA, dB, dc = tangents
-    K = _gain(A, B, c)
-    closed, change = A - B @ K, dA - dB @ K
-    n = A.shape[0]
-    identity = jnp.eye(n, dtype=A.dtype)
-    scale = lax.stop_gradient(_radius(c))
-    scale = 1.0 / jnp.where(scale > 0.0, scale, 1.0)
-    adjugate, size, columns, right = identity, jnp.ones_like(scale), [], []
-    for k in range(n):
-        size = size * scale
-        columns.append(size * (adjugate @ B)[:, 0])
-        right.append(size * (dc[k] + jnp.sum(adjugate.T * change)))
-        adjugate = closed @ adjugate + c[k] * identity
-    return K, linear_solve(jnp.stack(columns), jnp.stack(right)[:, None]).T
+    found = _placement(A, B, c)
+    K, by_coefficient, by_element = found
+    change = dA - dB @ K
+    dK = (dc @ by_coefficient + jnp.sum(by_element * change, axis=(1, 2)))[None]
+    _, tables = jax.jvp(_sensitivities, (A, B, K, c), (dA, dB, dK, dc))
+    return found, _Placement(dK, *tables)

@@ -28,15 +28,18 @@ def double_word(x: jax.Array) -> DoubleWord:
 
 
 def two_sum(a: jax.Array, b: jax.Array) -> DoubleWord:
-    """a + b, exactly (Knuth)."""
-    total = a + b
+    """a + b, exactly (Knuth).
+
+    The barrier is for where one of the two is a constant of the program: XLA would take it away again in advance.
+    """
+    total = lax.optimization_barrier(a + b)  # type: ignore[no-untyped-call]  # untyped in JAX
     part = total - a
     return DoubleWord(total, (a - (total - part)) + (b - part))
 
 
 def _fast_two_sum(a: jax.Array, b: jax.Array) -> DoubleWord:
-    """a + b, exactly, where |a| is at least |b|."""
-    total = a + b
+    """a + b, exactly, where |a| is at least |b|; the barrier as in `two_sum`."""
+    total = lax.optimization_barrier(a + b)  # type: ignore[no-untyped-call]  # untyped in JAX
     return DoubleWord(total, b - (total - a))
 
 

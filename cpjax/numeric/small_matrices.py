@@ -106,7 +106,8 @@ def _eliminate(rows: Matrix) -> tuple[Matrix, jax.Array]:
         pivot_row = row / pivot
         rows = jnp.where(numbers == index, row_k, rows)  # row k goes where the pivot's was
         rows = jnp.where(numbers == k, pivot_row, rows - _column(rows, k)[:, None] * pivot_row)
-        return rows, log_determinant + jnp.log(jnp.abs(pivot))
+        # After a pivot of zero the rows are NaN, but the determinant is known.
+        return rows, jnp.where(log_determinant == -jnp.inf, -jnp.inf, log_determinant + jnp.log(jnp.abs(pivot)))
 
     return lax.fori_loop(0, n, step, (rows, jnp.zeros_like(rows[0, 0])))
 

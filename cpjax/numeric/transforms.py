@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from cpjax.errors import InputError
 from cpjax.pytree import is_traced
@@ -50,12 +51,15 @@ def from_semidefinite(Q: jax.Array) -> jax.Array:
         if not np.max(np.abs(numbers - numbers.T)) <= room or not np.min(np.linalg.eigvalsh(numbers)) >= -room:
             raise InputError("Q", Q, "symmetric and positive semidefinite")
     # A pivot that is only rounding would be divided by; relative to its diagonal element it counts as zero.
-    room = 8.0 * n * np.finfo(Q.dtype).eps * jnp.diagonal(Q)
+    room = float(np.finfo(Q.dtype).eps) * jnp.diagonal(Q)
     rest, columns = Q, []
     for k in range(n):
         pivot = rest[k, k]
         holds = pivot > room[k]
         column = jnp.where(holds, rest[:, k] / jnp.sqrt(jnp.where(holds, pivot, 1.0)), 0.0)
+        # No element of a semidefinite matrix exceeds the geometric mean of its diagonal ones, but rounding may.
+        left = lax.stop_gradient(jnp.maximum(jnp.diagonal(rest), 0.0)) ** 0.5
+        column = jnp.where(jnp.abs(column) > 1.0001 * left, jnp.sign(column) * left, column)
         column = jnp.where(jnp.arange(n) >= k, column, 0.0)
         rest = rest - column[:, None] * column[None]
         columns.append(column)
