@@ -16,7 +16,7 @@ OPTIONS = [
     Option("gains", "Q", "what it was designed for: diagonal of the state weight", float, count=4, flag="q"),
     Option("gains", "R", "and the weight of the voltage", float, flag="r"),
     Option("gains", "placement_gain", "a gain of pole placement as printed", count=4),
-    Option("gains", "poles", "what it places, such as -3 -4 -5+2j -5-2j", count=4),
+    Option("gains", "poles", "what it places, such as -3 -4 -5+2j -5-2j", count=4, numbers=True),
     Option("audit", "parameters", "those that may change, with commas between (default all of the plant's)"),
     Option("audit", "most", "how many may change at once (default 2)", int),
     Option("audit", "starts", "random starts for each set of them (default 32)", int),
