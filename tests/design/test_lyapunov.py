@@ -173,7 +173,7 @@ def test_derivatives_of_first_and_second_order_agree_with_differences_forward_in
         return jnp.sum(solution(x) ** 2)
 
     batched, gradients = jax.jit(jax.vmap(solution)), jax.jit(jax.vmap(jax.grad(scalar)))
-    forward, reverse = (jax.jit(jax.vmap(d(solution)))(jnp.asarray(x)) for d in (jax.jacfwd, jax.jacrev))
+    forward, reverse = jax.jit(jax.vmap(lambda x: (jax.jacfwd(solution)(x), jax.jacrev(solution)(x))))(jnp.asarray(x))
     hessian, gradient = jax.jit(jax.hessian(scalar)), jax.jit(jax.grad(scalar))
     for i, point in enumerate(x):
         differences = jacobian(batched, point, 2e-3)

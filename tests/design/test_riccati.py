@@ -204,23 +204,21 @@ HIDDEN = {
 
 
 @both
-@pytest.mark.parametrize("name", HIDDEN)
-def test_a_mode_that_rounding_hides_is_refused_or_the_rounded_problem_is_solved(time, name):
+def test_a_mode_that_rounding_hides_is_refused_or_the_rounded_problem_is_solved(time):
     # Where rounding has given the mode a weight, the rounded problem has a solution; it never gives a mode an input.
-    slow, Q, B = HIDDEN[name]
-    problems = list(rotated(time, 400, slow[time], Q, B, seed=7))
-    P, K, found = solved_in_batches(time, problems)
-    assert np.all(np.isnan(P[~found]))
-    for (A, B, _, _), gain in zip(np.array(problems, dtype=object)[found], K[found], strict=True):
-        assert name.endswith("weight")
-        assert slowest(time, A, B, gain) > 0
-    for problem in problems[:10]:
-        try:
-            answer = SOLVERS[time](*problem)
-        except InputError:
-            continue
-        assert name.endswith("weight")
-        assert slowest(time, *problem[:2], answer.K) > 0
+    wrong = []
+    for name, (slow, Q, B) in HIDDEN.items():
+        problems = list(rotated(time, 400, slow[time], Q, B, seed=7))
+        P, K, found = solved_in_batches(time, problems)
+        assert np.all(np.isnan(P[~found]))
+        answers = [(*problems[i][:2], K[i]) for i in np.flatnonzero(found)]
+        for problem in problems[:10]:
+            try:
+                answers.append((*problem[:2], SOLVERS[time](*problem).K))
+            except InputError:
+                continue
+        wrong += [(name, answer) for answer in answers if "weight" not in name or not slowest(time, *answer) > 0]
+    assert not wrong
 
 
 @both
@@ -380,10 +378,7 @@ def steps(time, problem):
 
 @pytest.mark.parametrize(
     ("time", "n", "m"),
-    [
-        *(("continuous", *sizes) for sizes in [(2, 1), (4, 1), (5, 2)]),
-        *(("discrete", *sizes) for sizes in [(3, 2), (4, 1)]),
-    ],
+    [("continuous", 4, 1), ("continuous", 5, 2), ("discrete", 3, 2), ("discrete", 4, 1)],
 )
 def test_the_derivatives_in_all_arguments_agree_forward_in_reverse_and_with_differences(time, n, m):
     rng = np.random.default_rng(10 * n + m)
@@ -399,6 +394,8 @@ def test_the_derivatives_in_all_arguments_agree_forward_in_reverse_and_with_diff
         for one, other, difference in zip(*parts, strict=True):
             assert relative_error(one, difference) <= 1e-9
             assert relative_error(other, one) <= 1e-11
+    if (n, m) == (4, 1):
+        check_ill_conditioned_derivatives(time)
 
 
 def exact(x):
@@ -443,8 +440,8 @@ def ill_conditioned(time):
     return cheap, slow, chain
 
 
-@both
-def test_derivatives_lose_digits_in_proportion_to_the_closed_loops_condition_beyond_a_million(time):
+def check_ill_conditioned_derivatives(time):
+    """Beyond a condition of a million, digits are lost in proportion to it."""
     rng = np.random.default_rng(9)
     problems = ill_conditioned(time)
     batched, jacobians = functions(time, 4, 1)
@@ -480,12 +477,15 @@ def test_second_derivatives_are_the_differences_of_the_first_and_no_lane_of_a_ba
         P, K, _ = SOLVERS[time](*split(x, 2, 1))
         return jnp.sum(P * jnp.asarray([[1.0, -0.3], [-0.3, 0.5]])) + K[0, 0] - 2.0 * K[0, 1]
 
-    gradients, hessian = jax.jit(jax.vmap(jax.grad(scalar))), jax.jit(jax.hessian(scalar))(jnp.asarray(x))
-    assert relative_error(hessian, jacobian(gradients, x, steps(time, problem))) <= 1e-9
-    assert relative_error(hessian, hessian.T) <= 1e-12
+    gradients = jax.jit(jax.vmap(jax.grad(scalar)))
+    differences = jacobian(gradients, x, steps(time, problem))
+    assert relative_error(differences, differences.T) <= 1e-9
+    direction = np.random.default_rng(12).normal(size=x.shape)
+    second = jax.jit(lambda x, v: jax.jvp(jax.grad(scalar), (x,), (v,)))
+    alone, pushed = second(jnp.asarray(x), jnp.asarray(direction))
+    assert relative_error(pushed, differences @ direction) <= 1e-9
 
     A, B, Q, R = unsolvable(time)["an unstable mode that no input moves"][1]
     batch = gradients(jnp.asarray(np.stack([x, vector((A, B, Q, R, 0.0 * B)), x])))
-    assert np.all(np.isfinite(batch[jnp.asarray([0, 2])]))
     np.testing.assert_allclose(batch[0], batch[2], rtol=1e-15)
-    assert relative_error(batch[0], jax.jit(jax.grad(scalar))(jnp.asarray(x))) <= 1e-14
+    assert relative_error(batch[0], alone) <= 1e-14
