@@ -9,7 +9,8 @@ s' Q s + 2 s' N u + u' R u.
 Method: a structure-preserving doubling algorithm (Anderson, 1978; Chu, Fan and Lin, 2005) finds P to most of its
 digits. Newton's method (Kleinman, 1964; Hewer, 1971) corrects it, with the residual, P and K in double-word arithmetic,
 so that what is returned is the rounding of the exact solution, until the condition of the problem is beyond all floats.
-Each correction is a Lyapunov or Stein equation, and solving it proves the closed loop stable.
+Each correction is a Lyapunov or Stein equation, and solving it proves the closed loop stable. Where P and the solution
+of the dual equation are so large that doubling loses all digits, it is done again in double-word arithmetic too.
 
 Derivatives come from the same equations (Kao and Hennequin, 2020): with dA, dB, dQ, dN, dR and D = dA - dB K,
 
@@ -43,6 +44,7 @@ from cpjax.numeric.small_matrices import (
     largest,
     linear_solve,
     product,
+    solve,
     symmetric,
     transpose,
 )
@@ -149,8 +151,7 @@ def _solve_continuous(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> 
         rest = dw.add(dw.add(PA, transpose(PA)), rest)
         return sum_continuous(A - product(B, K.high), symmetric(rest.high))
 
-    start = _double(*_cayley(A, B, Q, R, N))
-    return _corrected(start, correction, gain, _weights_are_valid(Q, R, N))
+    return _found(_cayley(A, B, Q, R, N), correction, gain, _weights_are_valid(Q, R, N))
 
 
 @batch_last
@@ -171,13 +172,57 @@ def _solve_discrete(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tu
 
     A0, G, H = _without_cross_term(A, B, Q, R, N)
     scale = _balance(G, H)
-    start = _double(A0, G * scale, H / scale, scale)
-    return _corrected(start, correction, gain, _weights_are_valid(Q, R, N))
+    doubled = _Doubled(A0, G * scale, H / scale, scale)
+    return _found(doubled, correction, gain, _weights_are_valid(Q, R, N))
+
+
+class _Doubled(NamedTuple):
+    """What doubling starts from: E, G, H of a discrete-time problem, and P's scale."""
+
+    E: Matrix
+    G: Matrix
+    H: Matrix
+    scale: jax.Array
 
 
 class _Start(NamedTuple):
+    """What Newton's method starts from."""
+
     P: Matrix
     plausible: jax.Array
+
+
+class _Arithmetic(NamedTuple):
+    """The operations of a precision: on plain matrices, or on double-word ones."""
+
+    number: Callable[[Matrix], Any]
+    rounded: Callable[[Any], Matrix]
+    add: Callable[[Any, Any], Any]
+    product: Callable[[Any, Any], Any]
+    solve: Callable[[Any, Any], Any]
+
+
+_PLAIN = _Arithmetic(lambda x: x, lambda x: x, jnp.add, product, solve)
+_ACCURATE = _Arithmetic(double_word, lambda x: x.high, dw.add, accurate_product, accurate_solve)
+
+
+def _found(
+    problem: _Doubled,
+    correction: Callable[[DoubleWord], Sum],
+    gain: Callable[[DoubleWord], tuple[DoubleWord, DoubleWord]],
+    valid: jax.Array,
+) -> tuple[Matrix, Matrix]:
+    """P and K, NaN where there are none. The second attempt is made only if some member of the batch needs it."""
+    P, K = _corrected(_double(problem, _PLAIN), correction, gain, valid)
+    finite = jnp.all(jnp.isfinite(problem.E + problem.G + problem.H), axis=(0, 1))
+    missed = valid & finite & ~jnp.all(jnp.isfinite(P), axis=(0, 1))
+
+    def again() -> tuple[Matrix, Matrix]:
+        more = _corrected(_double(problem, _ACCURATE), correction, gain, missed)
+        return jnp.where(missed, more[0], P), jnp.where(missed, more[1], K)
+
+    found: tuple[Matrix, Matrix] = lax.cond(jnp.any(missed), again, lambda: (P, K))
+    return found
 
 
 def _without_cross_term(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix, Matrix]:
@@ -193,28 +238,45 @@ def _balance(G: Matrix, H: Matrix) -> jax.Array:
     return jnp.where((scale > 0.0) & jnp.isfinite(scale), scale, 1.0)
 
 
-def _cayley(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix, Matrix, jax.Array]:
-    """The discrete-time problem E, G, H with the same solution, up to the returned scale (Chu, Fan and Lin, 2005)."""
+def _cayley(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> _Doubled:
+    """The discrete-time problem with the same solution, up to its scale (Chu, Fan and Lin, 2005)."""
     A, G, H = _without_cross_term(A, B, Q, R, N)
     scale = _balance(G, H)
     G, H = G * scale, H / scale
     upper = jnp.concatenate([A, -G], axis=1)
     lower = jnp.concatenate([-H, -transpose(A)], axis=1)
-    # Near the geometric mean of the closed loop's eigenvalues; the factor keeps it from being one of A's by design.
-    shift = 1.0987 * cayley_shift(jnp.concatenate([upper, lower], axis=0))
+    shift = cayley_shift(jnp.concatenate([upper, lower], axis=0))
     identity = identity_like(A)
-    resolvent = inverse(shift * identity - A)
-    coupled = inverse(shift * identity - transpose(A) + product(H, resolvent, G))
-    E = 2.0 * shift * transpose(coupled) - identity
-    G = 2.0 * shift * product(resolvent, G, coupled)
-    H = 2.0 * shift * product(coupled, H, resolvent)
-    return E, symmetric(G), symmetric(H), scale
+
+    def inverses(shift: jax.Array) -> tuple[Matrix, Matrix, jax.Array]:
+        resolvent = shift * inverse(shift * identity - A)
+        coupled = shift * inverse(shift * identity - transpose(A) + product(H, resolvent / shift, G))
+        size = jnp.maximum(largest(resolvent), largest(coupled))
+        return resolvent, coupled, jnp.where(jnp.isfinite(size), size, jnp.inf)
+
+    # Near the geometric mean of the closed loop's eigenvalues; the factors keep it from being one of A's by design. By
+    # chance it may still be: of two, take the one that is farther away.
+    *one, near = inverses(1.0987 * shift)
+    *other, far = inverses(1.4321 * shift)
+    resolvent, coupled = (jnp.where(near <= far, x, y) for x, y in zip(one, other, strict=True))
+    shift = jnp.where(near <= far, 1.0987, 1.4321) * shift
+    E = 2.0 * transpose(coupled) - identity
+    G = 2.0 * product(resolvent, G, coupled) / shift
+    H = 2.0 * product(coupled, H, resolvent) / shift
+    return _Doubled(E, symmetric(G), symmetric(H), scale)
 
 
-def _double(E0: Matrix, G0: Matrix, H0: Matrix, scale: jax.Array) -> _Start:
+def _double(problem: _Doubled, arithmetic: _Arithmetic) -> _Start:
     """Anderson's doubling: H grows to the solution and G to that of the dual equation, while E vanishes."""
-    eps = np.finfo(E0.dtype).eps
-    Carry: TypeAlias = tuple[Matrix, Matrix, Matrix, jax.Array, jax.Array]
+    number, rounded, add, times, divide = arithmetic
+    eps = np.finfo(problem.E.dtype).eps
+    n = problem.E.shape[0]
+    identity = number(identity_like(problem.E))
+    Carry: TypeAlias = tuple[Any, Any, Any, jax.Array, jax.Array]
+
+    def even(x: Any) -> Any:
+        half = jax.tree.map(lambda part: 0.5 * part, x)
+        return add(half, transpose(half))
 
     def unfinished(carry: Carry) -> jax.Array:
         *_, finished, count = carry
@@ -222,22 +284,25 @@ def _double(E0: Matrix, G0: Matrix, H0: Matrix, scale: jax.Array) -> _Start:
 
     def double(carry: Carry) -> Carry:
         E, G, H, _, count = carry
-        V = inverse(identity_like(E) + product(G, H))
-        EV = product(E, V)
-        more_G = product(EV, G, transpose(E))
-        more_H = product(transpose(E), H, V, E)
-        G, H = symmetric(G + more_G), symmetric(H + more_H)
+        both = jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=1), G, E)
+        both = divide(add(identity, times(G, H)), both)
+        VG, VE = (jax.tree.map(lambda x, part=part: x[:, part], both) for part in (slice(n), slice(n, None)))
+        more_G = times(times(E, VG), transpose(E))
+        more_H = times(times(transpose(E), H), VE)
+        G, H = even(add(G, more_G)), even(add(H, more_H))
         # Convergence is quadratic: what comes after a change of sqrt(eps) is below eps.
-        change = jnp.maximum(_relative_size(more_G, G), _relative_size(more_H, H))
-        return product(EV, E), G, H, ~(change > eps**0.5), count + 1
+        change = jnp.maximum(_relative_size(rounded(more_G), rounded(G)), _relative_size(rounded(more_H), rounded(H)))
+        return times(E, VE), G, H, ~(change > eps**0.5), count + 1
 
-    finished = jnp.zeros(E0.shape[2:], dtype=bool)
-    E, G, H, _, _ = lax.while_loop(unfinished, double, (E0, G0, H0, finished, jnp.zeros((), dtype=jnp.int32)))
+    finished = jnp.zeros(problem.E.shape[2:], dtype=bool)
+    E0, G0, H0 = number(problem.E), number(problem.G), number(problem.H)
+    _, G, H, _, _ = lax.while_loop(unfinished, double, (E0, G0, H0, finished, jnp.zeros((), dtype=jnp.int32)))
     # Where a mode that is not stable is not seen, G grows to where overflow or rounding stops it: it is then no
     # solution of the dual equation. (Where one cannot be moved, H is none of this, and Newton's method finds none.)
-    again = G0 + product(E0, G, inverse(identity_like(E) + product(H0, G)), transpose(E0))
+    again = rounded(add(G0, times(times(E0, divide(add(identity, times(G, H0)), G)), transpose(E0))))
+    G, H = rounded(G), rounded(H)
     plausible = (largest(again - G) <= 0.4 * largest(G)) & (jnp.sum(G * H, axis=(0, 1)) < 0.01 / eps**2)
-    return _Start(H * scale, plausible)
+    return _Start(H * problem.scale, plausible)
 
 
 def _relative_size(change: Matrix, P: Matrix) -> jax.Array:

@@ -179,7 +179,6 @@ def one_weighed_output(m):
     return [x.astype(np.float32).astype(np.float64) for x in problems]
 
 
-@pytest.mark.xfail(strict=False, reason="of these sixteen-state problems a few are refused as too ill-conditioned")
 @pytest.mark.parametrize(("dtype", "m", "tolerance"), [(np.float64, 1, 1e-5), (np.float32, 3, 1e-4)])
 def test_sixteen_states_of_which_one_output_is_weighed_have_the_gain_that_scipy_finds(dtype, m, tolerance):
     problems = one_weighed_output(m)

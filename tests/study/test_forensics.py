@@ -196,7 +196,8 @@ def test_no_small_change_of_a_fitted_parameter_fits_better(papers):
             for factor in (0.999, 0.99999, 1.00001, 1.001):
                 values = {**dict(zip(fit.parameters, fit.values, strict=True)), name: value * factor}
                 moved = (scipys_gains(changed(APPENDIX, values), *design) - printed) / 0.01
-                assert np.sum(moved**2) > least
+                # SciPy's gains have 9 good digits, and a parameter of no consequence changes fewer.
+                assert np.sum(moved**2) > least * (1.0 - 1e-9), (name, factor)
 
 
 def test_progress_counts_the_sets_up_to_their_number():
