@@ -23,7 +23,7 @@ from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor, linearize
 from cpjax.pytree import Number, cast, check, is_traced
 from cpjax.sim.integrators import rk4
-from cpjax.sim.rollout import check_settings
+from cpjax.sim.settings import check_settings
 from cpjax.sim.stepper import applied_voltage, step_held
 from cpjax.state import NAMES, State
 

@@ -4,7 +4,7 @@ from cpjax.controllers.energy import EnergySwingUp
 from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.gates import AngleGate, AngleRateGate, Gate, LyapunovGate
 from cpjax.controllers.hybrid import Hybrid
-from cpjax.controllers.protocol import REGULATE, SWING_UP, Controller, Law, SingleLaw, as_controller
+from cpjax.controllers.protocol import REGULATE, SWING_UP, Controller, Law, SingleLaw, SmoothController, as_controller
 
 __all__ = [
     "REGULATE",
@@ -18,6 +18,7 @@ __all__ = [
     "Law",
     "LyapunovGate",
     "SingleLaw",
+    "SmoothController",
     "StateFeedback",
     "as_controller",
 ]

@@ -70,7 +70,7 @@ class AngleRateGate:
 
 @pytree
 class LyapunovGate:
-    """Open in a level set of s' P s, s the deviation from `reference`: margin = level - s' P s."""
+    """Open in a level set of s' P s, s the deviation from `reference`: margin = 1 - s' P s / level."""
 
     P: Array = matrix((4, 4), "per product of states", "symmetric weight, such as LQR's P", symmetric=True)
     level: Scalar = number("1", "s' P s up to which the gate is open", above=0.0)
@@ -81,11 +81,11 @@ class LyapunovGate:
         object.__setattr__(self, "reference", checked_reference("LyapunovGate.reference", self.reference))
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
-        """In the unit of `level`."""
+        """Unit 1."""
         s = deviation(state, self.reference)
         # Written out, not as a matrix product: under vmap each component stays an array of its own.
         form = sum(self.P[i, j] * s[i] * s[j] for i in range(4) for j in range(4))
-        return self.level * _size(self.hysteresis, mode) - form
+        return _size(self.hysteresis, mode) - form / self.level
 
 
 def _size(hysteresis: Scalar, mode: jax.Array) -> jax.Array:

@@ -32,3 +32,12 @@ class Hybrid:
     def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
         """Both laws are evaluated and one is taken; the other, if finite, contributes neither value nor derivative."""
         return jnp.where(mode == REGULATE, self.regulator.voltage(state), self.swing_up.voltage(state))
+
+    def margin(self, state: State, mode: jax.Array) -> Scalar:
+        """The gate's margin, with the sign that keeps `mode` where it is positive."""
+        margin = self.gate.margin(state, mode)
+        return jnp.where(mode == REGULATE, margin, -margin)
+
+    def successor(self, mode: jax.Array) -> jax.Array:
+        """The other one."""
+        return (SWING_UP + REGULATE) - mode

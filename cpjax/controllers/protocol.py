@@ -46,6 +46,19 @@ class Controller(Protocol):
         ...
 
 
+@runtime_checkable
+class SmoothController(Controller, Protocol):
+    """A controller whose mode ends where a smooth function vanishes, so that the moment can be located."""
+
+    def margin(self, state: State, mode: jax.Array) -> Scalar:
+        """At least 0 while `mode` lasts, smooth in the state near 0."""
+        ...
+
+    def successor(self, mode: jax.Array) -> jax.Array:
+        """Mode after `mode`, once its margin has vanished."""
+        ...
+
+
 @pytree
 class SingleLaw:
     """A `Law` as a `Controller` that never leaves mode 0."""
@@ -60,6 +73,12 @@ class SingleLaw:
 
     def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
         return self.law.voltage(state)
+
+    def margin(self, state: State, mode: jax.Array) -> Scalar:
+        return jnp.ones_like(state.x)
+
+    def successor(self, mode: jax.Array) -> jax.Array:
+        return mode
 
 
 def as_controller(controller: Controller | Law) -> Controller:

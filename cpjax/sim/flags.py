@@ -1,7 +1,10 @@
 """What can go wrong in a rollout. Inside `jit` nothing raises, so it is written down instead."""
 
 import enum
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 
@@ -16,10 +19,14 @@ class Flag(enum.IntFlag):
     """A parameter or the next state was NaN or infinite. The state was held at its last finite value."""
 
     CHATTERING = 4
-    """The mode changed at CHATTER_LENGTH control instants in a row. The run went on; a gate wants hysteresis."""
+    """The mode changed at CHATTER_LENGTH control instants in a row, or, located, so many times within one step. The run
+    went on; a gate wants hysteresis."""
+
+    OVERFLOW = 8
+    """Located switching used up its spare steps, by many crossings or by chattering. The state was held there."""
 
 
-STOPPED = int(Flag.RUNAWAY | Flag.NON_FINITE)
+STOPPED = int(Flag.RUNAWAY | Flag.NON_FINITE | Flag.OVERFLOW)
 """Flags after which the state is held, and the run is no success."""
 
 CHATTER_LENGTH = 8
@@ -29,3 +36,9 @@ def describe(flag: int) -> str:
     """The flag in words, such as "runaway" or "clean"."""
     names = [bit.name.lower().replace("_", "-") for bit in Flag if int(np.asarray(flag)) & bit and bit.name]
     return ", ".join(names) or "clean"
+
+
+def unknown(tree: Any) -> jax.Array:
+    """NON_FINITE if a leaf of the tree is NaN, else 0; int32."""
+    leaves = jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(tree)])
+    return jnp.where(jnp.any(leaves), int(Flag.NON_FINITE), 0).astype(jnp.int32)

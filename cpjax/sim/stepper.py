@@ -1,15 +1,16 @@
 """One step of the closed loop: plant, applied voltage and integrator put together."""
 
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
-from cpjax.controllers.protocol import Controller
+from cpjax.controllers.protocol import Controller, SmoothController
 from cpjax.numeric.trigonometry import sin_cos
 from cpjax.plant import CartPole
 from cpjax.pytree import Scalar
 from cpjax.sim.integrators import Acceleration, Integrator
+from cpjax.sim.switching import Observation
 from cpjax.state import State
 
 Pair: TypeAlias = tuple[Scalar, Scalar]
@@ -54,7 +55,7 @@ def step_continuous(
 
     def acceleration(q: Pair, v: Pair) -> Pair:
         sin, cos = sin_cos(q[1])
-        voltage = applied_voltage(plant, controller, State(q[0], v[0], q[1], v[1]), mode)
+        voltage = applied_voltage(plant, controller, _state(q, v), mode)
         return plant.acceleration(sin, cos, v, plant.motor.force(voltage, v[0]))
 
     return _integrate(integrator, acceleration, state, dt, first)
@@ -64,4 +65,61 @@ def _integrate(
     integrator: Integrator, acceleration: Acceleration, state: State, dt: Scalar, first: Pair | None
 ) -> State:
     q, v = integrator(acceleration, (state.x, state.theta), (state.x_dot, state.theta_dot), dt, first)
+    return _state(q, v)
+
+
+class Mode(NamedTuple):
+    """In which the closed loop is smooth."""
+
+    law: jax.Array
+    """The controller's mode, int32."""
+    clip: jax.Array
+    """Where the demanded voltage is: 1 above the limit, -1 below it, 0 inside, int32."""
+
+
+class ClosedLoop(NamedTuple):
+    """Plant and controller as a `System` of smooth modes, on the continuous clock.
+
+    Its guards are the two ends of the supply, relative to the limit, and the controller's margin; its output is the
+    applied voltage.
+    """
+
+    plant: CartPole
+    controller: SmoothController
+
+    def observe(self, q: Pair, v: Pair, mode: Mode) -> Observation:
+        state = _state(q, v)
+        limit = self.plant.motor.voltage_limit
+        demand = self._demand(state, mode.law)
+        relative = demand / limit  # 0 for an infinite supply
+        guards = (
+            jnp.where(mode.clip > 0, relative - 1.0, 1.0 - relative),
+            jnp.where(mode.clip < 0, -1.0 - relative, 1.0 + relative),
+            self.controller.margin(state, mode.law),
+        )
+        voltage = jnp.where(mode.clip == 0, demand, jnp.where(mode.clip > 0, limit, -limit))
+        sin, cos = sin_cos(q[1])
+        acceleration = self.plant.acceleration(sin, cos, v, self.plant.motor.force(voltage, v[0]))
+        return Observation(acceleration, guards, voltage)
+
+    def jump(self, q: Pair, v: Pair, mode: Mode, guard: jax.Array) -> tuple[Pair, Pair, Mode]:
+        law = jnp.where(guard == 2, self.controller.successor(mode.law), mode.law)
+        end = jnp.where(guard == 0, 1, -1)
+        clip = jnp.where(mode.clip == 0, end, 0)
+        return q, v, Mode(law, jnp.where(guard == 2, self._clip(_state(q, v), law), clip).astype(mode.clip.dtype))
+
+    def start_mode(self, start: State) -> Mode:
+        """At the start of a rollout."""
+        law = self.controller.start_mode(start)
+        return Mode(law, self._clip(start, law))
+
+    def _clip(self, state: State, law: jax.Array) -> jax.Array:
+        demand, limit = self._demand(state, law), self.plant.motor.voltage_limit
+        return (demand > limit).astype(jnp.int32) - (demand < -limit).astype(jnp.int32)
+
+    def _demand(self, state: State, law: jax.Array) -> jax.Array:
+        return jnp.asarray(self.controller.mode_voltage(state, law), dtype=jnp.asarray(state.x).dtype)
+
+
+def _state(q: Pair, v: Pair) -> State:
     return State(q[0], v[0], q[1], v[1])

@@ -11,7 +11,8 @@ from cpjax.controllers.protocol import Controller, Law
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.sim.metrics import Fold
-from cpjax.sim.rollout import Clock, Switching, measure
+from cpjax.sim.rollout import measure
+from cpjax.sim.settings import Checkpoint, Clock, Switching
 from cpjax.state import State, checked_start
 
 Progress = Callable[[int, int], None]
@@ -29,6 +30,8 @@ def sweep(
     control_period: float | None = None,
     switching: Switching = "per_step",
     integrator: str = "rk4",
+    spare_steps: int | None = None,
+    checkpoint: Checkpoint = "every_step",
     metrics: Fold | None = None,
     chunk: int = 4096,
     progress: Progress | None = None,
@@ -64,6 +67,8 @@ def sweep(
             control_period=control_period,
             switching=switching,
             integrator=integrator,
+            spare_steps=spare_steps,
+            checkpoint=checkpoint,
             metrics=metrics,
         )
 

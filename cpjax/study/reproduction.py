@@ -12,7 +12,8 @@ import numpy as np
 from cpjax import io, paper
 from cpjax.errors import InputError
 from cpjax.sim.metrics import Metrics
-from cpjax.sim.rollout import Trajectory, check_settings, rollout
+from cpjax.sim.rollout import Trajectory, rollout
+from cpjax.sim.settings import check_settings
 from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
 from cpjax.state import HANGING, State

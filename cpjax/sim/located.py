@@ -1,0 +1,113 @@
+"""The closed loop on the continuous clock with its changes of mode located: see `switching.py`.
+
+Each iteration is one step of the automaton there. What the clip does to the voltage is a mode too: where a demanded
+voltage reaches the limit, the vector field has a kink, over which a Runge-Kutta step loses its order, and its
+derivatives with it.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.controllers.protocol import SmoothController
+from cpjax.plant import CartPole
+from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, Flag, unknown
+from cpjax.sim.integrators import INTEGRATORS, Integrator
+from cpjax.sim.metrics import Fold, Sample
+from cpjax.sim.scan import scan
+from cpjax.sim.settings import Settings
+from cpjax.sim.stepper import ClosedLoop
+from cpjax.sim.switching import LANDED, Clock, iterate, start_clock
+from cpjax.state import ANGLE_LIMIT, RUNAWAY_LIMIT, State
+
+
+class _Loop(NamedTuple):
+    """The scan's carry."""
+
+    clock: Clock
+    flag: jax.Array
+
+
+def simulate(
+    start: State, plant: CartPole, controller: SmoothController, fold: Fold, dt: jax.Array, settings: Settings
+) -> tuple[Sample | None, Sample, Any]:
+    """The samples that are kept (None if none are), the last one, and what the fold made of all of them."""
+    system, integrator = ClosedLoop(plant, controller), INTEGRATORS[settings.integrator]
+    steps, iterations = settings.steps, settings.steps + settings.spare_steps
+    clock = start_clock(system, (start.x, start.theta), (start.x_dot, start.theta_dot), system.start_mode(start), dt)
+    loop = _Loop(clock, unknown((start, plant, controller)))
+    first = _sample(loop, clock.seen.output, dt)
+    memory = fold.update(fold.init(first), first)
+
+    def body(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], tuple[Sample, jax.Array] | None]:
+        loop, memory = carry
+        before = loop.clock
+        loop, reached = _advance(system, integrator, loop, dt, steps, iterations - index)
+        now = loop.clock.seen.output
+        sample = _sample(loop, jnp.where(before.stage == LANDED, before.seen.output, now), dt)
+        memory = jax.tree.map(lambda new, old: jnp.where(reached, new, old), fold.update(memory, sample), memory)
+        return (loop, memory), (None if settings.save_every is None else (sample, loop.clock.passed))
+
+    carry, kept = scan(body, (loop, memory), jnp.arange(iterations), settings.checkpoint)
+    loop, memory = carry
+    last = _sample(loop, loop.clock.seen.output, dt)
+    samples = None
+    if kept is not None:
+        samples, passed = kept
+        # The first iteration after which so many grid points have been passed.
+        wanted = jnp.arange(settings.save_every, steps + 1, settings.save_every, dtype=passed.dtype)
+        rows = jnp.searchsorted(passed, wanted)
+        samples = jax.tree.map(lambda one, many: jnp.concatenate([one[None], many[rows]]), first, samples)
+    return samples, last, fold.finish(memory, last)
+
+
+def _sample(loop: _Loop, voltage_before: jax.Array, dt: jax.Array) -> Sample:
+    """At the last point that was reached; `voltage_before` is that of the mode until then."""
+    clock = loop.clock
+    return Sample(
+        time=clock.passed.astype(dt.dtype) * dt + clock.offset,
+        elapsed=clock.elapsed,
+        state=State(clock.q[0], clock.v[0], clock.q[1], clock.v[1]),
+        voltage=clock.seen.output,
+        voltage_before=voltage_before,
+        mode=clock.mode.law,
+        cart_acceleration=jnp.asarray(clock.seen.acceleration[0]),
+        flag=loop.flag,
+    )
+
+
+def _advance(
+    system: ClosedLoop, integrator: Integrator, loop: _Loop, dt: jax.Array, steps: int, left: jax.Array
+) -> tuple[_Loop, jax.Array]:
+    """One iteration. A run that would leave the bounds, become non-finite, or not end in the iterations that are left,
+    is held at the last point and flagged; its samples go on.
+
+    As on the other path (`per_step.py`), a step that is about to go wrong is taken from upright rest and dropped, so
+    that no infinity of a branch that is not taken reaches a derivative.
+    """
+    clock = loop.clock
+    stopped, ended = (loop.flag & STOPPED) != 0, clock.passed >= steps
+    acceleration = clock.seen.acceleration
+    ahead = jnp.maximum(jnp.abs(clock.v[0] + dt * acceleration[0]), jnp.abs(clock.v[1] + dt * acceleration[1]))
+    going = ~stopped & ~ended & (ahead <= RUNAWAY_LIMIT)
+    moving = (clock.q, clock.v, clock.seen, clock.slopes, clock.offset, clock.step)
+    safe = jax.tree.map(lambda x: jnp.where(going, x, 0.0), moving)
+    names = ("q", "v", "seen", "slopes", "offset", "step")
+    after, reached = iterate(system, integrator, clock._replace(**dict(zip(names, safe, strict=True))), dt)
+    fastest = jnp.maximum(jnp.abs(after.v[0]), jnp.abs(after.v[1]))
+    within = (jnp.maximum(jnp.abs(after.q[0]), fastest) <= RUNAWAY_LIMIT) & (jnp.abs(after.q[1]) <= ANGLE_LIMIT)
+    in_time = left > steps - after.passed
+    good = going & within & in_time
+    finite = jnp.isfinite(ahead + after.q[0] + after.v[0] + after.q[1] + after.v[1])
+    reason = jnp.where(in_time, jnp.where(finite, int(Flag.RUNAWAY), int(Flag.NON_FINITE)), int(Flag.OVERFLOW))
+    chatter = jnp.where(good & (after.crossings >= CHATTER_LENGTH), int(Flag.CHATTERING), 0)
+    flag = loop.flag | jnp.where(stopped | ended | good, 0, reason) | chatter
+    # A run that is held passes one grid point an iteration.
+    held = clock._replace(
+        passed=clock.passed + (~ended).astype(clock.passed.dtype),
+        offset=jnp.zeros_like(clock.offset),
+        elapsed=jnp.where(ended, clock.elapsed, 0.0),
+    )
+    clock = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, held)
+    return _Loop(clock, flag), (good & reached) | (~good & ~ended)

@@ -1,0 +1,129 @@
+"""The closed loop in equal steps: law and gate are read at control instants, and the mode is kept in between.
+
+At each step `_observe` reads the controller and takes a sample, `_advance` integrates to the next.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.controllers.protocol import Controller
+from cpjax.numeric.trigonometry import sin_cos
+from cpjax.plant import CartPole
+from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, Flag, unknown
+from cpjax.sim.integrators import INTEGRATORS
+from cpjax.sim.metrics import Fold, Sample
+from cpjax.sim.scan import scan
+from cpjax.sim.settings import Settings
+from cpjax.sim.stepper import Pair, applied_voltage, step_continuous, step_held
+from cpjax.state import ANGLE_LIMIT, RUNAWAY_LIMIT, State
+
+
+class _Loop(NamedTuple):
+    """The scan's carry."""
+
+    state: State
+    mode: jax.Array
+    voltage: jax.Array
+    flag: jax.Array
+    changes: jax.Array
+    """Control instants in a row at which the mode changed."""
+
+
+def simulate(
+    start: State, plant: CartPole, controller: Controller, fold: Fold, dt: jax.Array, settings: Settings
+) -> tuple[Sample | None, Sample, Any]:
+    """The samples that are kept (None if none are), the last one, and what the fold made of all of them."""
+    steps, every = settings.steps, settings.save_every
+    none = jnp.zeros_like(start.x, dtype=jnp.int32)
+    mode = controller.start_mode(start)
+    voltage = applied_voltage(plant, controller, start, mode)
+    loop = _Loop(start, mode, voltage, unknown((start, plant, controller)), none)
+    _, first, _ = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
+
+    def body(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], Sample | None]:
+        loop, memory = carry
+        loop, sample, rates = _observe(plant, controller, loop, index, dt, settings)
+        memory = fold.update(memory, sample)
+        loop = _advance(plant, controller, loop, rates, dt, settings)
+        return (loop, memory), (sample if every == 1 else None)
+
+    def block(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], Sample]:
+        _, sample, _ = _observe(plant, controller, carry[0], index, dt, settings)
+        carry, _ = scan(body, carry, index + jnp.arange(every), "every_step")
+        return carry, sample
+
+    carry = (loop, fold.init(first))
+    if every is None or every == 1:
+        carry, samples = scan(body, carry, jnp.arange(steps), settings.checkpoint)
+    else:
+        carry, samples = scan(block, carry, jnp.arange(0, steps, every), "every_step")
+    loop, memory = carry
+    _, last, _ = _observe(plant, controller, loop, jnp.asarray(steps), dt, settings)
+    if samples is not None:
+        samples = jax.tree.map(lambda many, one: jnp.concatenate([many, one[None]]), samples, last)
+    return samples, last, fold.finish(fold.update(memory, last), last)
+
+
+def _observe(
+    plant: CartPole, controller: Controller, loop: _Loop, index: jax.Array, dt: jax.Array, settings: Settings
+) -> tuple[_Loop, Sample, Pair]:
+    """Reads the controller at step `index`, if that is a control instant, takes a sample, and hands the accelerations
+    at this instant on to `_advance`, whose first stage they are."""
+    state = loop.state
+    mode = controller.next_mode(state, loop.mode)
+    voltage = applied_voltage(plant, controller, state, mode)
+    changes = jnp.where(mode != loop.mode, loop.changes + 1, 0)
+    if settings.clock == "continuous":
+        voltage_before = applied_voltage(plant, controller, state, loop.mode)
+    else:
+        voltage_before = loop.voltage
+        if settings.steps_per_control > 1:
+            instant = index % settings.steps_per_control == 0
+            mode = jnp.where(instant, mode, loop.mode)
+            voltage = jnp.where(instant, voltage, loop.voltage)
+            changes = jnp.where(instant, changes, loop.changes)
+    flag = loop.flag | jnp.where(changes >= CHATTER_LENGTH, int(Flag.CHATTERING), 0)
+    sin, cos = sin_cos(state.theta)
+    force = plant.motor.force(voltage, state.x_dot)
+    rates = plant.acceleration(sin, cos, (state.x_dot, state.theta_dot), force)
+    sample = Sample(
+        time=index.astype(dt.dtype) * dt,
+        elapsed=jnp.where((index > 0) & ((flag & STOPPED) == 0), dt, 0.0),
+        state=state,
+        voltage=voltage,
+        voltage_before=voltage_before,
+        mode=mode,
+        cart_acceleration=jnp.asarray(rates[0]),
+        flag=flag,
+    )
+    return _Loop(state, mode, voltage, flag, changes), sample, rates
+
+
+def _advance(
+    plant: CartPole, controller: Controller, loop: _Loop, rates: Pair, dt: jax.Array, settings: Settings
+) -> _Loop:
+    """Integrates one step. A run that would leave the bounds, or become non-finite, is held where it is and flagged.
+
+    A derivative in reverse passes through both branches of a `where`, and 0 times an infinity of the branch not taken
+    is NaN. So a step that is about to go wrong (told by an Euler step) is not taken from where it would: it is taken
+    from upright rest, where all is finite, and dropped. (A law that is itself not finite at a state it is asked about
+    still gives NaN derivatives; those of this library are finite.)
+    """
+    state, method = loop.state, INTEGRATORS[settings.integrator]
+    stopped = (loop.flag & STOPPED) != 0
+    ahead = jnp.maximum(jnp.abs(state.x_dot + dt * rates[0]), jnp.abs(state.theta_dot + dt * rates[1]))
+    going = ~stopped & (ahead <= RUNAWAY_LIMIT)
+    safe, safe_rates = jax.tree.map(lambda value: jnp.where(going, value, 0.0), (state, rates))
+    if settings.clock == "continuous":
+        after = step_continuous(plant, controller, method, safe, loop.mode, dt, safe_rates)
+    else:
+        after = step_held(plant, method, safe, jnp.where(going, loop.voltage, 0.0), dt, safe_rates)
+    fastest = jnp.maximum(jnp.abs(after.x_dot), jnp.abs(after.theta_dot))
+    within = (jnp.maximum(jnp.abs(after.x), fastest) <= RUNAWAY_LIMIT) & (jnp.abs(after.theta) <= ANGLE_LIMIT)
+    good = going & within
+    finite = jnp.isfinite(ahead + after.x + after.x_dot + after.theta + after.theta_dot)
+    reason = jnp.where(finite, int(Flag.RUNAWAY), int(Flag.NON_FINITE))
+    state = jax.tree.map(lambda old, new: jnp.where(good, new, old), state, after)
+    return loop._replace(state=state, flag=loop.flag | jnp.where(stopped | good, 0, reason))
