@@ -32,7 +32,8 @@ def crossing_fraction(start: Scalar, start_slope: Scalar, end: Scalar, end_slope
     second = rise - start_slope - third
     low, high = jnp.zeros_like(rise), jnp.ones_like(rise)
     above = jnp.maximum(start, 0.0)
-    t = above / jnp.where(above > end, above - end, 1.0)
+    # A start on the boundary is a root, but not the one that is sought if the function rises from there.
+    t = jnp.where(above > 0.0, above / jnp.where(above > end, above - end, 1.0), 0.5)
     for _ in range(_ITERATIONS):
         value = start + t * (start_slope + t * (second + t * third))
         slope = start_slope + t * (2.0 * second + t * (3.0 * third))

@@ -471,6 +471,7 @@ def test_the_margins_of_an_unstable_lag_have_their_textbook_derivatives_in_the_g
     assert slopes.disk_gain == pytest.approx(1.0)  # of k
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_those_of_the_first():
     A, B, K = map(jnp.asarray, papers_loop("appendix", "placement"))
     direction = jnp.asarray([1.0, -2.0, 3.0, 1.0])

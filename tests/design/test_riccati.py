@@ -393,7 +393,12 @@ def steps(time, problem):
 
 @pytest.mark.parametrize(
     ("time", "n", "m"),
-    [("continuous", 4, 1), ("continuous", 5, 2), ("discrete", 3, 2), ("discrete", 4, 1)],
+    [
+        ("continuous", 4, 1),
+        pytest.param("continuous", 5, 2, marks=pytest.mark.slow),
+        ("discrete", 3, 2),
+        pytest.param("discrete", 4, 1, marks=pytest.mark.slow),
+    ],
 )
 def test_the_derivatives_in_all_arguments_agree_forward_in_reverse_and_with_differences(time, n, m):
     rng = np.random.default_rng(10 * n + m)
@@ -478,7 +483,7 @@ def check_ill_conditioned_derivatives(time):
     assert max(conditions) > 1e7
 
 
-@both
+@pytest.mark.parametrize("time", ["continuous", pytest.param("discrete", marks=pytest.mark.slow)])
 def test_second_derivatives_are_the_differences_of_the_first_and_no_lane_of_a_batch_of_gradients_spoils_another(time):
     problem = random_problem(2, 1, np.random.default_rng(11))
     x = vector(problem)
