@@ -15,6 +15,8 @@ from cpjax.controllers import (
     EnergySwingUp,
     Hybrid,
     LyapunovGate,
+    SmoothClip,
+    SmoothHybrid,
     StateFeedback,
 )
 from cpjax.design.discretization import discretize, discretize_cost
@@ -25,7 +27,8 @@ from cpjax.errors import InputError
 from cpjax.io import load, save
 from cpjax.plant import CartPole, LinearModel, Motor, linearize
 from cpjax.sim.flags import Flag
-from cpjax.sim.metrics import Metrics, ProtocolMetrics
+from cpjax.sim.gradients import Gradients, gradients
+from cpjax.sim.metrics import Metrics, ProtocolMetrics, TimeOutside
 from cpjax.sim.rollout import Trajectory, measure, rollout
 from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
@@ -46,6 +49,7 @@ __all__ = [
     "CartPole",
     "EnergySwingUp",
     "Flag",
+    "Gradients",
     "Hybrid",
     "InputError",
     "LinearModel",
@@ -54,8 +58,11 @@ __all__ = [
     "Motor",
     "ProtocolMetrics",
     "QuadraticFactors",
+    "SmoothClip",
+    "SmoothHybrid",
     "State",
     "StateFeedback",
+    "TimeOutside",
     "Trajectory",
     "__version__",
     "care",
@@ -63,6 +70,7 @@ __all__ = [
     "discretize",
     "discretize_cost",
     "dlqr",
+    "gradients",
     "linearize",
     "load",
     "lqr",

@@ -29,6 +29,8 @@ from cpjax.controllers import (
     Hybrid,
     LyapunovGate,
     SingleLaw,
+    SmoothClip,
+    SmoothHybrid,
     StateFeedback,
 )
 from cpjax.errors import InputError
@@ -58,6 +60,8 @@ TYPES: dict[str, type] = {
         LyapunovGate,
         Hybrid,
         SingleLaw,
+        SmoothHybrid,
+        SmoothClip,
         ProtocolMetrics,
         Metrics,
         Trajectory,

@@ -5,6 +5,7 @@ from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.gates import AngleGate, AngleRateGate, Gate, LyapunovGate
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import REGULATE, SWING_UP, Controller, Law, SingleLaw, SmoothController, as_controller
+from cpjax.controllers.smooth import SmoothClip, SmoothHybrid
 
 __all__ = [
     "REGULATE",
@@ -18,7 +19,9 @@ __all__ = [
     "Law",
     "LyapunovGate",
     "SingleLaw",
+    "SmoothClip",
     "SmoothController",
+    "SmoothHybrid",
     "StateFeedback",
     "as_controller",
 ]

@@ -18,7 +18,7 @@ from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
 from cpjax.sim.stepper import ClosedLoop
-from cpjax.sim.switching import LANDED, Clock, iterate, start_clock
+from cpjax.sim.switching import LANDED, Clock, iterate, pick, start_clock
 from cpjax.state import ANGLE_LIMIT, RUNAWAY_LIMIT, State
 
 
@@ -37,21 +37,19 @@ def simulate(
     steps, iterations = settings.steps, settings.steps + settings.spare_steps
     clock = start_clock(system, (start.x, start.theta), (start.x_dot, start.theta_dot), system.start_mode(start), dt)
     loop = _Loop(clock, unknown((start, plant, controller)))
-    first = _sample(loop, clock.seen.output, dt)
+    first = _sample(loop, clock, dt)
     memory = fold.update(fold.init(first), first)
 
     def body(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], tuple[Sample, jax.Array] | None]:
-        loop, memory = carry
-        before = loop.clock
-        loop, reached = _advance(system, integrator, loop, dt, steps, iterations - index)
-        now = loop.clock.seen.output
-        sample = _sample(loop, jnp.where(before.stage == LANDED, before.seen.output, now), dt)
+        before, memory = carry
+        loop, reached = _advance(system, integrator, before, dt, steps, iterations - index)
+        sample = _sample(loop, before.clock, dt)
         memory = jax.tree.map(lambda new, old: jnp.where(reached, new, old), fold.update(memory, sample), memory)
         return (loop, memory), (None if settings.save_every is None else (sample, loop.clock.passed))
 
     carry, kept = scan(body, (loop, memory), jnp.arange(iterations), settings.checkpoint)
     loop, memory = carry
-    last = _sample(loop, loop.clock.seen.output, dt)
+    last = _sample(loop, loop.clock, dt)
     samples = None
     if kept is not None:
         samples, passed = kept
@@ -62,18 +60,21 @@ def simulate(
     return samples, last, fold.finish(memory, last)
 
 
-def _sample(loop: _Loop, voltage_before: jax.Array, dt: jax.Array) -> Sample:
-    """At the last point that was reached; `voltage_before` is that of the mode until then."""
+def _sample(loop: _Loop, before: Clock, dt: jax.Array) -> Sample:
+    """At the last point that was reached; `before` is the clock an iteration earlier."""
     clock = loop.clock
+    landed = before.stage == LANDED
     return Sample(
         time=clock.passed.astype(dt.dtype) * dt + clock.offset,
         elapsed=clock.elapsed,
         state=State(clock.q[0], clock.v[0], clock.q[1], clock.v[1]),
         voltage=clock.seen.output,
-        voltage_before=voltage_before,
+        voltage_before=jnp.where(landed, before.seen.output, clock.seen.output),
         mode=clock.mode.law,
         cart_acceleration=jnp.asarray(clock.seen.acceleration[0]),
         flag=loop.flag,
+        crossing=jnp.where(landed, before.guard + 1, 0),
+        crossing_speed=jnp.where(landed, -pick(before.slopes, before.guard), 0.0),
     )
 
 

@@ -35,6 +35,10 @@ class Sample(NamedTuple):
     """x'' from now on [m/s^2]."""
     flag: jax.Array
     """Bits of `Flag`."""
+    crossing: jax.Array
+    """What was located here, int32: 0 nothing, 1 and 2 the upper and the lower end of the supply, 3 the gate."""
+    crossing_speed: jax.Array
+    """How fast that guard fell [1/s]: of the voltage relative to the limit, or of the gate's margin. 0 elsewhere."""
 
 
 class Fold(Protocol):
@@ -79,6 +83,35 @@ class Metrics:
     peak_cart_acceleration: jax.Array
     switches: jax.Array
     flag: jax.Array
+
+
+@pytree
+class TimeOutside:
+    """The fold that yields a smooth and bounded stand-in for the settling time [s].
+
+    The integral of 1 - exp(-(theta / angle_width)^2 / 2 - ((x - reference_x) / position_width)^2 / 2), theta wrapped:
+    the time spent farther from upright in place than the widths, roughly. By the trapezoidal rule.
+    """
+
+    angle_width: Scalar = number("rad", "of the target", default=0.2, above=0.0)
+    position_width: Scalar = number("m", "of the target", default=0.2, above=0.0)
+    reference_x: Scalar = number("m", "where the cart is to settle", default=0.0)
+
+    def init(self, sample: Sample) -> tuple[jax.Array, jax.Array]:
+        return jnp.zeros_like(sample.time), self._outside(sample)
+
+    def update(self, memory: tuple[jax.Array, jax.Array], sample: Sample) -> tuple[jax.Array, jax.Array]:
+        total, before = memory
+        now = self._outside(sample)
+        return total + 0.5 * sample.elapsed * (before + now), now
+
+    def finish(self, memory: tuple[jax.Array, jax.Array], last: Sample) -> jax.Array:
+        return memory[0]
+
+    def _outside(self, sample: Sample) -> jax.Array:
+        angle = wrap_angle(sample.state.theta) / self.angle_width
+        away = (sample.state.x - self.reference_x) / self.position_width
+        return 1.0 - jnp.exp(-0.5 * (angle * angle + away * away))
 
 
 class _Memory(NamedTuple):

@@ -97,6 +97,8 @@ def _observe(
         mode=mode,
         cart_acceleration=jnp.asarray(rates[0]),
         flag=flag,
+        crossing=jnp.zeros_like(mode),
+        crossing_speed=jnp.zeros_like(voltage),
     )
     return _Loop(state, mode, voltage, flag, changes), sample, rates
 

@@ -117,15 +117,15 @@ def iterate(system: System, integrator: Integrator, clock: Clock, dt: jax.Array)
         soonest = jnp.minimum(secant, soonest)
     fell = soonest < jnp.inf
     fraction = crossing_fraction(
-        _pick(seen.guards, first),
-        step * _pick(clock.slopes, first),
-        _pick(ahead.guards, first),
-        step * _pick(slopes, first),
+        pick(seen.guards, first),
+        step * pick(clock.slopes, first),
+        pick(ahead.guards, first),
+        step * pick(slopes, first),
     )
 
-    value = _pick(ahead.guards, clock.guard)
-    steepness = (jnp.abs(_pick(seen.guards, clock.guard)) + jnp.abs(value)) / dt
-    correction = newton_correction(value, _pick(slopes, clock.guard), steepness)
+    value = pick(ahead.guards, clock.guard)
+    steepness = (jnp.abs(pick(seen.guards, clock.guard)) + jnp.abs(value)) / dt
+    correction = newton_correction(value, pick(slopes, clock.guard), steepness)
     correction = jnp.clip(correction, -0.25 * dt, 0.25 * dt)  # beyond that it is no correction
     corrected = step + correction
     refine = locating & ~fell & (stage < _CORRECTIONS)
@@ -171,7 +171,7 @@ def _observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation,
     return seen, lax.stop_gradient(slopes)
 
 
-def _pick(values: Guards, number: jax.Array) -> jax.Array:
+def pick(values: Guards, number: jax.Array) -> jax.Array:
     """values[number], without a gather: under `vmap` each of them is an array of its own."""
     picked = jnp.asarray(values[0])
     for k, value in enumerate(values[1:], start=1):

@@ -1,0 +1,54 @@
+"""Smooth surrogates of the switch and of the clip, for those who want them. Nothing in the library puts them in.
+
+They are other controllers, not other views of the same one: their trajectories differ from those of the hard law, the
+less so the lower the temperature, and their derivatives are those of their own trajectories.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.controllers.gates import Gate
+from cpjax.controllers.protocol import SWING_UP, Law
+from cpjax.pytree import Scalar, number, part, pytree
+from cpjax.state import State
+
+
+@pytree
+class SmoothHybrid:
+    """Both laws at once, the regulator's share rising from 0 to 1 across the gate's boundary. A law without a mode.
+
+        u = w u_regulator + (1 - w) u_swing_up,     w = 1 / (1 + exp(-margin / temperature))
+
+    The margin is that of the way in: a mixture remembers nothing, so a gate's hysteresis has no effect.
+    """
+
+    swing_up: Law = part("a law", "voltage")
+    regulator: Law = part("a law", "voltage")
+    gate: Gate = part("a gate", "margin")
+    temperature: Scalar = number("1", "margin over which the share rises from 1/2 to 3/4, almost", above=0.0)
+
+    def voltage(self, state: State) -> Scalar:
+        """Demanded voltage [V]."""
+        margin = self.gate.margin(state, jnp.asarray(SWING_UP, dtype=jnp.int32))
+        share = jax.nn.sigmoid(margin / self.temperature)
+        return share * self.regulator.voltage(state) + (1.0 - share) * self.swing_up.voltage(state)
+
+
+@pytree
+class SmoothClip:
+    """A law whose demand bends towards the supply's limits instead of breaking off at them, and never exceeds them.
+
+        clip(v) = T log((1 + exp((v + L) / T)) / (1 + exp((v - L) / T))) - L
+
+    with L the limit and T the temperature. Where a motor has the same limit, its own clip is left nothing to do.
+    """
+
+    law: Law = part("a law", "voltage")
+    voltage_limit: Scalar = number("V", "supply, as of the motor", above=0.0)
+    temperature: Scalar = number("V", "over which the demand bends", above=0.0)
+
+    def voltage(self, state: State) -> Scalar:
+        """Demanded voltage [V]."""
+        demand, limit, temperature = self.law.voltage(state), self.voltage_limit, self.temperature
+        above, below = (demand - limit) / temperature, (demand + limit) / temperature
+        return temperature * (jax.nn.softplus(below) - jax.nn.softplus(above)) - limit

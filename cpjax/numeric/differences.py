@@ -1,0 +1,49 @@
+"""Derivatives by differences, extrapolated, with an estimate of their error (Ridders, 1982)."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+Numbers: TypeAlias = np.ndarray[Any, Any]
+
+
+class Differences(NamedTuple):
+    """A derivative, and how far it may be off; both of one shape. NaN and infinite where there is none."""
+
+    derivative: Numbers
+    uncertainty: Numbers
+
+
+def central_differences(
+    function: Callable[[float], tuple[Numbers, Numbers]],
+    steps: Numbers,
+    valid: Callable[[float], Numbers] | None = None,
+) -> Differences:
+    """The derivative at 0 of a function of one variable, or of many such functions at once.
+
+    Extrapolates the central differences of all consecutive steps to step 0, and returns, of all the extrapolations, the
+    one that changes least with one step more or less: large steps are off by curvature, small ones by rounding.
+
+    Args:
+      function: takes a step h and returns the function at +h and at -h, arrays of one shape (...).
+      steps: falling by one factor.
+      valid: whether the difference of a step counts, (...); for functions that are smooth only nearby.
+    """
+    factor = (steps[0] / steps[1]) ** 2
+    rows: list[list[Numbers]] = []
+    best = Differences(np.array(np.nan), np.array(np.inf))
+    for step in steps:
+        above, below = function(float(step))
+        first = (above - below) / (2.0 * step)
+        if valid is not None:
+            first = np.where(valid(float(step)), first, np.nan)
+        row = [first]
+        for order, coarse in enumerate(rows[-1] if rows else [], start=1):
+            finer = row[-1] + (row[-1] - coarse) / (factor**order - 1.0)
+            change = np.maximum(np.abs(finer - row[-1]), np.abs(finer - coarse))
+            row.append(finer)
+            better = change < best.uncertainty
+            best = Differences(np.where(better, finer, best.derivative), np.where(better, change, best.uncertainty))
+        rows.append(row)
+    return best

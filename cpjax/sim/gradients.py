@@ -1,0 +1,69 @@
+"""Gradients of an objective at many starts, in chunks, forward or in reverse."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from cpjax.errors import InputError
+from cpjax.state import State, checked_start
+
+Direction: TypeAlias = Literal["reverse", "forward"]
+Objective: TypeAlias = Callable[[Any, State], jax.Array]
+"""A number from parameters and one start, such as an entry of what `cpjax.measure` returns."""
+
+
+class Gradients(NamedTuple):
+    """Of each start."""
+
+    value: jax.Array
+    """Shape (n,)."""
+    gradient: Any
+    """The parameters' tree, each leaf with a leading axis n."""
+
+
+def gradients(
+    objective: Objective, parameters: Any, starts: State, *, direction: Direction = "reverse", chunk: int = 64
+) -> Gradients:
+    """Value and gradient of `objective(parameters, start)` at every start.
+
+    Compiled once for an objective: pass the same function again, not a new one that does the same. What a step costs
+    in memory is chosen where the objective calls `cpjax.measure`, by `checkpoint`; docs/gradients.md has measurements.
+
+    Args:
+      parameters: a tree of floats or floating-point arrays.
+      starts: a State of arrays of shape (n,), any n.
+      direction: "reverse" costs a few rollouts whatever the number of parameters, and memory for each step; "forward"
+        costs about one rollout for each parameter, and hardly any memory.
+      chunk: starts at a time, at most.
+
+    Raises:
+      InputError: another direction, a chunk below 1, or starts that `cpjax.sweep` would not take.
+    """
+    if not isinstance(direction, str) or direction not in get_args(Direction):
+        raise InputError("direction", direction, "reverse or forward")
+    if isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1:
+        raise InputError("chunk", chunk, "a whole number of starts, at least 1")
+    starts, _ = checked_start(starts, "starts", batched=True)
+    found: Gradients = _gradients(parameters, starts, objective=objective, direction=direction, chunk=chunk)
+    return found
+
+
+@functools.partial(jax.jit, static_argnames=("objective", "direction", "chunk"))
+def _gradients(parameters: Any, starts: State, *, objective: Objective, direction: Direction, chunk: int) -> Gradients:
+    def at(start: State) -> Gradients:
+        if direction == "reverse":
+            return Gradients(*jax.value_and_grad(objective)(parameters, start))
+        value, gradient = jax.jacfwd(lambda p: (objective(p, start),) * 2, has_aux=True)(parameters)[::-1]
+        return Gradients(value, gradient)
+
+    total = jnp.shape(starts.x)[0]
+    count = math.ceil(total / chunk)
+    size = math.ceil(total / count)  # as even as can be
+    members = jnp.minimum(jnp.arange(count * size), total - 1).reshape(count, size)
+    found = lax.map(lambda rows: jax.vmap(at)(jax.tree.map(lambda column: column[rows], starts)), members)
+    return jax.tree.map(lambda x: x.reshape(count * size, *x.shape[2:])[:total], found)

@@ -1,0 +1,357 @@
+"""Can a gradient through a swing-up be trusted? For a controller, its parameters, starts and an objective.
+
+Three ways to a derivative are held against the finite difference of the rollout with located switching: automatic
+differentiation of that rollout, of the rollout that reads its mode once per step ("plain"), and of rollouts with smooth
+surrogates. All of them at several horizons, and beside them what makes gradients bad: slow crossings of the gate, and
+sensitivity that grows with time.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cpjax import io
+from cpjax.controllers import Hybrid, SmoothClip, SmoothHybrid
+from cpjax.controllers.protocol import Controller, Law
+from cpjax.errors import InputError
+from cpjax.numeric.differences import Differences, central_differences
+from cpjax.plant import CartPole
+from cpjax.pytree import pytree
+from cpjax.sim.flags import STOPPED, describe
+from cpjax.sim.metrics import Fold, Sample, TimeOutside
+from cpjax.sim.rollout import measure
+from cpjax.sim.settings import check_settings
+from cpjax.state import NAMES, State, checked_start
+
+Numbers: TypeAlias = np.ndarray[Any, Any]
+Build: TypeAlias = Callable[[Mapping[str, jax.Array]], tuple[CartPole, Controller | Law]]
+"""Plant and controller of parameters. Traced."""
+Report: TypeAlias = Callable[[int, int, str], None]
+
+SLOW_CROSSING = 0.1
+"""Below this speed of the gate's margin [1/s] a crossing counts as grazing."""
+
+LARGE_GROWTH = 1e4
+"""Above this norm of d state / d start a run counts as chaotic."""
+
+SMALL_SHARE = 1e-3
+"""A parameter's derivative is compared with itself, or with this share of the largest of its run, if that is more."""
+
+_STEPS = 1e-3 * 4.0 ** -np.arange(7)
+
+
+@dataclasses.dataclass(frozen=True)
+class GradientAudit:
+    """What `audit_gradients` found, for n starts, k horizons and d parameters.
+
+    Derivatives are with respect to relative changes: of a parameter p, p times the derivative in p, or its scale times
+    the derivative where a scale was given. Shape (n, k, d).
+
+    Attributes:
+      names: of the parameters, d; "Q[0]" for an element.
+      horizons: (k,) [s].
+      temperatures: of the smooth surrogates.
+      value: the objective (n, k).
+      located: derivatives by automatic differentiation, with located switching.
+      plain: the same, with switching per step.
+      smooth: the same, one array for each temperature.
+      difference: finite differences of the rollout with located switching; NaN where no stencil stays on one side of
+        every kink.
+      uncertainty: of them, as they estimate it themselves.
+      crossings: of the gate (n, k).
+      speed: the slowest of those [1/s] (n, k); infinite if none.
+      growth: norm of d state / d start, in SI units (n, k).
+      flag: bits of `Flag` of the run with located switching (n,).
+    """
+
+    names: tuple[str, ...]
+    horizons: Numbers
+    temperatures: tuple[float, ...]
+    value: Numbers
+    located: Numbers
+    plain: Numbers
+    smooth: tuple[Numbers, ...]
+    difference: Numbers
+    uncertainty: Numbers
+    crossings: Numbers
+    speed: Numbers
+    growth: Numbers
+    flag: Numbers
+
+    def errors(self, gradient: Numbers) -> Numbers:
+        """|gradient - difference| relative to the difference (n, k, d); see `SMALL_SHARE`. NaN where that is NaN."""
+        size = np.abs(self.difference)
+        largest = np.nanmax(np.where(np.isnan(size), -1.0, size), axis=-1, keepdims=True)
+        distance = np.abs(gradient - self.difference)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(distance == 0.0, 0.0 * size, distance / np.maximum(size, SMALL_SHARE * largest))
+
+    def wrong_signs(self, gradient: Numbers) -> Numbers:
+        """Whether gradient and difference have different signs, zero being one (n, k, d)."""
+        return ~np.isnan(self.difference) & (np.sign(gradient) != np.sign(self.difference))
+
+    @property
+    def trusted(self) -> Numbers:
+        """Whether the verdict on a start is trustworthy (n,)."""
+        return np.array([kind == "trustworthy" for kind, _ in self.verdicts])
+
+    @property
+    def verdicts(self) -> list[tuple[str, str]]:
+        """For each start: trustworthy, grazing, chaotic or stopped; and why. At the last horizon."""
+        found = []
+        for flag, speed, growth, crossings in zip(
+            self.flag, self.speed[:, -1], self.growth[:, -1], self.crossings[:, -1], strict=True
+        ):
+            if flag & STOPPED:
+                found.append(("stopped", describe(flag)))
+            elif not growth <= LARGE_GROWTH:
+                found.append(("chaotic", f"a change of the start grows {growth:.2g} times"))
+            elif speed < SLOW_CROSSING:
+                found.append(("grazing", f"crosses the gate at {speed:.2g} / s"))
+            else:
+                reason = f"slowest of {crossings} crossings {speed:.2g} / s, " if crossings else "no crossing, "
+                found.append(("trustworthy", reason + f"growth {growth:.2g}"))
+        return found
+
+
+class _Probe(NamedTuple):
+    """At each horizon: the first axis."""
+
+    value: jax.Array
+    state: jax.Array
+    """(k, 4)."""
+    crossings: jax.Array
+    speed: jax.Array
+    path: jax.Array
+    """A number made of the sequence of crossings, of gate and supply: equal for equal sequences."""
+
+
+class _Memory(NamedTuple):
+    objective: Any
+    crossings: jax.Array
+    speed: jax.Array
+    path: jax.Array
+    probe: _Probe
+
+
+@pytree
+class _Prober:
+    """The fold that keeps an objective and what led to it at several horizons."""
+
+    objective: Any
+    horizons: Any
+
+    def init(self, sample: Sample) -> _Memory:
+        k, dtype = self.horizons.shape[0], sample.time.dtype
+        none = jnp.zeros_like(sample.mode)
+        probe = _Probe(
+            jnp.zeros(k, dtype),
+            jnp.zeros((k, 4), dtype),
+            jnp.zeros(k, jnp.int32),
+            jnp.full(k, jnp.inf, dtype),
+            jnp.zeros(k, jnp.uint32),
+        )
+        far = jnp.full_like(sample.time, jnp.inf)
+        return _Memory(self.objective.init(sample), none, far, none.astype(jnp.uint32), probe)
+
+    def update(self, memory: _Memory, sample: Sample) -> _Memory:
+        objective = self.objective.update(memory.objective, sample)
+        at_gate = sample.crossing == 3
+        crossings = memory.crossings + at_gate.astype(jnp.int32)
+        speed = jnp.where(at_gate, jnp.minimum(memory.speed, sample.crossing_speed), memory.speed)
+        path = jnp.where(
+            sample.crossing > 0,
+            memory.path * jnp.uint32(2654435761) + sample.crossing.astype(jnp.uint32),
+            memory.path,
+        )
+        now = _Probe(self.objective.finish(objective, sample), sample.state.vector(), crossings, speed, path)
+        within = sample.time <= self.horizons
+        probe = jax.tree.map(
+            lambda new, old: jnp.where(within.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), now, memory.probe
+        )
+        return _Memory(objective, crossings, speed, path, probe)
+
+    def finish(self, memory: _Memory, last: Sample) -> tuple[_Probe, jax.Array]:
+        return memory.probe, last.flag
+
+
+def audit_gradients(
+    build: Build,
+    parameters: Mapping[str, Any],
+    starts: State,
+    *,
+    duration: float = 4.0,
+    dt: float = 1e-3,
+    horizons: Sequence[float] | None = None,
+    objective: Fold | None = None,
+    scales: Mapping[str, float] | None = None,
+    temperatures: Sequence[float] = (0.1, 0.01),
+    each: bool = False,
+    progress: Report | None = None,
+) -> GradientAudit:
+    """Compares the gradients of an objective at every start; see `GradientAudit`.
+
+    Args:
+      build: makes the plant and a `cpjax.Hybrid` of the parameters; run designs such as `cpjax.lqr` in it.
+      parameters: numbers and vectors by name.
+      starts: a State of arrays (n,).
+      duration: of the rollouts [s].
+      dt: their step [s].
+      horizons: where the objective is read [s]; by default quarters of the duration.
+      objective: a fold whose result is a number; `TimeOutside()` by default.
+      scales: what counts as a whole change of a parameter; by default its value.
+      temperatures: of the smooth surrogates: of the gate's margin, and of the clip relative to the supply.
+      each: whether the parameters have a leading axis n, one set for each start.
+      progress: called with the number of parts done, their total, and the next one's name.
+
+    Raises:
+      InputError: arguments that no rollout takes, or a controller that is not a Hybrid.
+    """
+    starts, dtype = checked_start(starts, "starts", batched=True)
+    check_settings(duration, dt, "continuous", None, "located", "rk4", None)
+    ends = duration * np.arange(1, 5) / 4.0 if horizons is None else np.asarray(horizons, dtype=np.float64)
+    if ends.ndim != 1 or ends.size == 0 or not (np.all(ends > 0) and np.all(ends <= duration * (1 + 1e-9))):
+        raise InputError("horizons", horizons, f"times above 0 s and at most the duration, {duration:g} s")
+    n = int(jnp.shape(starts.x)[0])
+    names, x, shapes = _vector(parameters, n, each)
+    scale = _scales(names, x, scales or {})
+    fold = _Prober(TimeOutside() if objective is None else objective, jnp.asarray(ends + 0.25 * dt, dtype))
+
+    def made(vector: jax.Array) -> tuple[CartPole, Hybrid]:
+        plant, controller = build(_tree(vector, shapes))
+        if not isinstance(controller, Hybrid):
+            raise InputError("build", controller, "one that makes a cpjax.Hybrid")
+        return plant, controller
+
+    def probe(vector: jax.Array, start: State, switching: Any, temperature: float | None) -> tuple[_Probe, jax.Array]:
+        plant, controller = made(vector)
+        law: Any = controller
+        if temperature is not None:
+            smooth = SmoothHybrid(controller.swing_up, controller.regulator, controller.gate, temperature)
+            limit = plant.motor.voltage_limit
+            law = SmoothClip(smooth, limit, temperature * limit)
+        found: tuple[_Probe, jax.Array] = measure(
+            plant, law, start, duration=duration, dt=dt, switching=switching, metrics=fold
+        )
+        return found
+
+    def slopes(switching: Any, temperature: float | None = None) -> tuple[Any, Any, _Probe, Numbers]:
+        def of_all(vector: jax.Array, start: jax.Array) -> tuple[Any, Any]:
+            found, flag = probe(vector, State.from_vector(start), switching, temperature)
+            return (found.value, found.state), (found, flag)
+
+        jacobian = jax.jit(jax.vmap(jax.jacfwd(of_all, argnums=(0, 1), has_aux=True)))
+        (value, state), (found, flag) = jacobian(jnp.asarray(x, dtype), starts.vector())
+        return np.asarray(value[0], np.float64) * scale[:, None], np.asarray(state[1]), found, np.asarray(flag)
+
+    parts = 2 + len(temperatures) + len(_STEPS)
+    done = 0
+
+    def report(text: str) -> None:
+        nonlocal done
+        if progress is not None:
+            progress(done, parts, text)
+        done += 1
+
+    report("located switching")
+    located, by_start, found, flag = slopes("located")
+    report("switching per step")
+    plain, *_ = slopes("per_step")
+    smooth = []
+    for temperature in temperatures:
+        report(f"smooth, temperature {temperature:g}")
+        smooth.append(slopes("per_step", float(temperature))[0])
+    difference = _differences(probe, x, starts, scale, found, report)
+    report("done")
+    return GradientAudit(
+        names=names,
+        horizons=ends,
+        temperatures=tuple(map(float, temperatures)),
+        value=np.asarray(found.value),
+        located=located,
+        plain=plain,
+        smooth=tuple(smooth),
+        difference=difference.derivative,
+        uncertainty=difference.uncertainty,
+        crossings=np.asarray(found.crossings),
+        speed=np.asarray(found.speed),
+        growth=np.linalg.norm(by_start, ord=2, axis=(-2, -1)),
+        flag=flag,
+    )
+
+
+def _differences(
+    probe: Callable[..., Any], x: Numbers, starts: State, scale: Numbers, found: _Probe, report: Callable[[str], None]
+) -> Differences:
+    """Of the rollout with located switching, in relative changes (n, k, d)."""
+    n, d = x.shape
+    run = jax.jit(jax.vmap(lambda vector, start: probe(vector, start, "located", None)[0]))
+    many = jax.tree.map(lambda column: jnp.repeat(column, 2 * d), starts)
+    moves = np.stack([np.eye(d), -np.eye(d)])  # (2, d, d)
+    same: dict[float, Numbers] = {}
+
+    def ends(step: float) -> tuple[Numbers, Numbers]:
+        report(f"differences with steps of {step:.0e}")
+        points = x[:, None, None] + step * scale[:, None, None] * moves
+        there = run(jnp.asarray(points.reshape(n * 2 * d, d), jnp.asarray(starts.x).dtype), many)
+        value, path = (np.asarray(part).reshape(n, 2, d, -1) for part in (there.value, there.path))
+        same[step] = np.moveaxis(np.all(path == np.asarray(found.path)[:, None, None], axis=1), 1, 2)
+        above, below = np.moveaxis(value, 2, 3).swapaxes(0, 1)
+        return above, below
+
+    return central_differences(ends, _STEPS, lambda step: same[step])
+
+
+def _vector(parameters: Mapping[str, Any], n: int, each: bool) -> tuple[tuple[str, ...], Numbers, Any]:
+    """Names of the elements, values (n, d), and what makes the mapping again."""
+    names: list[str] = []
+    columns, shapes = [], []
+    for name, value in parameters.items():
+        array = np.asarray(value, dtype=np.float64)
+        array = array if each else np.broadcast_to(array, (n, *array.shape))
+        if array.ndim not in (1, 2) or array.shape[0] != n or not np.all(np.isfinite(array)):
+            raise InputError(f"parameters[{name}]", value, "a finite number or vector" + (", for each start" * each))
+        shapes.append((name, array.shape[1:]))
+        names += [name] if array.ndim == 1 else [f"{name}[{i}]" for i in range(array.shape[1])]
+        columns.append(array.reshape(n, -1))
+    if not columns:
+        raise InputError("parameters", parameters, "at least one")
+    return tuple(names), np.concatenate(columns, axis=1), tuple(shapes)
+
+
+def _tree(vector: jax.Array, shapes: Any) -> dict[str, jax.Array]:
+    tree, at = {}, 0
+    for name, shape in shapes:
+        size = math.prod(shape)
+        tree[name] = vector[at : at + size].reshape(shape)
+        at += size
+    return tree
+
+
+def _scales(names: tuple[str, ...], x: Numbers, given: Mapping[str, float]) -> Numbers:
+    scale = np.abs(x)
+    known = {name.split("[")[0] for name in names} | set(names)
+    for name, value in given.items():
+        if name not in known:
+            raise InputError(f"scales[{name}]", value, "the name of a parameter: " + ", ".join(sorted(known)))
+        if not (math.isfinite(value) and value > 0):
+            raise InputError(f"scales[{name}]", value, "a finite number above 0")
+        chosen = [i for i, one in enumerate(names) if name in (one, one.split("[")[0])]
+        scale[:, chosen] = value
+    zero = [name for name, column in zip(names, scale.T, strict=True) if np.any(column == 0.0)]
+    if zero:
+        raise InputError(f"scales[{zero[0]}]", given.get(zero[0]), "given, where a parameter is zero")
+    return scale
+
+
+def document(audit: GradientAudit, starts: State, **setting: Any) -> dict[str, Any]:
+    """The audit for programs."""
+    columns = {name: np.asarray(getattr(starts, name)) for name in NAMES}
+    fields = {f.name: getattr(audit, f.name) for f in dataclasses.fields(audit)}
+    verdicts = [{"verdict": kind, "reason": reason} for kind, reason in audit.verdicts]
+    return {"versions": io.versions(), **setting, "starts": columns, **fields, "verdicts": verdicts}
