@@ -4,7 +4,7 @@
 
 For each pair the objective's derivatives by automatic differentiation with located switching, with switching per step,
 and of smooth surrogates, are held against Ridders' extrapolated differences of the rollout with located switching. The
-objective is the smooth time outside the target over 4 s, at steps of 0.5 ms.
+objective is the smooth time outside a wide target (1.5 rad, 0.5 m) over 4 s, at steps of 0.5 ms.
 
 Left out, by a rule that was fixed before any comparison and knows nothing of it: runs that are stopped, that cross the
 gate slower than 0.1 / s, or in which a change of the start grows more than ten thousand times. Counted apart: stencils
@@ -20,26 +20,29 @@ from _common import run
 from _random_loops import GROUPS, draw
 from matplotlib.figure import Figure
 
+import cpjax
 from cpjax import io
 from cpjax.cli.progress import Report, progress
 from cpjax.show.figures import save_figure
 from cpjax.study.gradient_audit import GradientAudit, audit_gradients
 
 DURATION, DT = 4.0, 0.5e-3
+OBJECTIVE = cpjax.TimeOutside(angle_width=1.5, position_width=0.5)
 
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
     """Prints a table for each parameter and writes gradient_accuracy.json and gradient_accuracy.png."""
     count = 3 if quick else 50
-    setting: dict[str, Any] = {"duration": 1.6, "dt": 2e-3} if quick else {"duration": DURATION, "dt": DT}
+    setting: dict[str, Any] = {"duration": 2.4, "dt": 2e-3} if quick else {"duration": DURATION, "dt": DT}
     audits: dict[str, GradientAudit] = {}
     with progress("gradient accuracy") as report:
-        for k, group in enumerate(GROUPS):
+        for k, group in enumerate(GROUPS[2:3] if quick else GROUPS):
             parameters, starts = draw(group, count, seed=seed + k, **setting)
             audits[group.name] = audit_gradients(
                 group.build,
                 parameters,
                 starts,
+                objective=OBJECTIVE,
                 each=True,
                 temperatures=(0.1,) if quick else (0.1, 0.03, 0.01),
                 scales={"cart_friction": 0.1, "pivot_friction": 0.01},

@@ -21,7 +21,7 @@ from cpjax.controllers.protocol import Controller, Law
 from cpjax.errors import InputError
 from cpjax.numeric.differences import Differences, central_differences
 from cpjax.plant import CartPole
-from cpjax.pytree import pytree
+from cpjax.pytree import part, pytree
 from cpjax.sim.flags import STOPPED, describe
 from cpjax.sim.metrics import Fold, Sample, TimeOutside
 from cpjax.sim.rollout import measure
@@ -143,8 +143,9 @@ class _Memory(NamedTuple):
 class _Prober:
     """The fold that keeps an objective and what led to it at several horizons."""
 
-    objective: Any
-    horizons: Any
+    objective: Fold = part("a fold", "init", "update", "finish")
+    horizons: Any = None
+    """(k,) [s]."""
 
     def init(self, sample: Sample) -> _Memory:
         k, dtype = self.horizons.shape[0], sample.time.dtype
