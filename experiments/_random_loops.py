@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import cpjax
+from cpjax.sim.flags import STOPPED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,10 +73,11 @@ _RANGES = {
 
 def draw(
     group: Group, count: int, *, seed: int, duration: float, dt: float
-) -> tuple[dict[str, np.ndarray[Any, Any]], cpjax.State]:
-    """Parameters, each with a leading axis, and `hanging` starts: equal parts that cross the gate once, twice and more.
+) -> tuple[dict[str, np.ndarray[Any, Any]], cpjax.State, float]:
+    """Parameters, each with a leading axis, `hanging` starts, and the share of all draws whose run is stopped.
 
-    As far as eight times as many draws yield them; the rest is made up of runs that cross once.
+    Of eight times as many draws, those whose run is not stopped, in equal parts runs that cross the gate once, twice and
+    more; as far as there are so many, or else more of those that cross once.
     """
     rng = np.random.default_rng(seed)
     many = 8 * count
@@ -95,18 +97,17 @@ def draw(
         p["polynomial"] = np.array([np.polymul(*pair)[1:] for pair in factors])
     starts = cpjax.sample_starts("hanging", many, seed=seed)
 
-    def crossings(p: Any, start: cpjax.State) -> jax.Array:
+    def seen(p: Any, start: cpjax.State) -> tuple[jax.Array, jax.Array]:
         plant, law = group.build(p)
-        switches: jax.Array = cpjax.measure(plant, law, start, duration=duration, dt=dt, switching="located").switches
-        return switches
+        run = cpjax.measure(plant, law, start, duration=duration, dt=dt, switching="located")
+        return run.switches, run.flag
 
-    found = np.asarray(
-        jax.jit(jax.vmap(crossings))({k: jnp.asarray(v) for k, v in p.items()}, jax.tree.map(jnp.asarray, starts))
-    )
+    traced = jax.tree.map(jnp.asarray, (p, starts))
+    switches, flags = (np.asarray(column) for column in jax.jit(jax.vmap(seen))(*traced))
+    crossings = np.where(flags & STOPPED, -1, np.minimum(switches, 3))
     third = -(-count // 3)
-    chosen = [*np.flatnonzero(found == 2)[:third], *np.flatnonzero(found > 2)[:third]]
-    chosen = [*chosen, *np.flatnonzero(found == 1)][:count]
-    chosen = [*chosen, *[i for i in range(many) if i not in chosen]][:count]
-    return {name: value[chosen] for name, value in p.items()}, jax.tree.map(
-        lambda column: column[np.array(chosen)], starts
-    )
+    chosen = [*np.flatnonzero(crossings == 2)[:third], *np.flatnonzero(crossings == 3)[:third]]
+    chosen = [*chosen, *np.flatnonzero(crossings == 1)][:count]
+    chosen += [i for i in np.flatnonzero(crossings >= 0) if i not in chosen][: count - len(chosen)]
+    rows = np.array(chosen)
+    return {k: v[rows] for k, v in p.items()}, jax.tree.map(lambda c: c[rows], starts), float(np.mean(crossings < 0))

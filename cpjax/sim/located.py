@@ -47,7 +47,7 @@ def simulate(
         memory = jax.tree.map(lambda new, old: jnp.where(reached, new, old), fold.update(memory, sample), memory)
         return (loop, memory), (None if settings.save_every is None else (sample, loop.clock.passed))
 
-    carry, kept = scan(body, (loop, memory), jnp.arange(iterations), settings.checkpoint)
+    carry, kept = scan(body, (loop, memory), jnp.arange(iterations, dtype=jnp.int32), settings.checkpoint)
     loop, memory = carry
     last = _sample(loop, loop.clock, dt)
     samples = None

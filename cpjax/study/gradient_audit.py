@@ -42,6 +42,9 @@ LARGE_GROWTH = 1e4
 SMALL_SHARE = 1e-3
 """A parameter's derivative is compared with itself, or with this share of the largest of its run, if that is more."""
 
+RESOLUTION = 3e-7
+"""A difference that is less certain than this, relative to what errors are relative to, decides nothing."""
+
 _STEPS = 1e-3 * 4.0 ** -np.arange(7)
 
 
@@ -86,14 +89,31 @@ class GradientAudit:
     def errors(self, gradient: Numbers) -> Numbers:
         """|gradient - difference| relative to the difference (n, k, d); see `SMALL_SHARE`. NaN where that is NaN."""
         size = np.abs(self.difference)
-        largest = np.nanmax(np.where(np.isnan(size), -1.0, size), axis=-1, keepdims=True)
         distance = np.abs(gradient - self.difference)
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.where(distance == 0.0, 0.0 * size, distance / np.maximum(size, SMALL_SHARE * largest))
+            return np.where(distance == 0.0, 0.0 * size, distance / np.maximum(size, SMALL_SHARE * self._largest()))
 
     def wrong_signs(self, gradient: Numbers) -> Numbers:
-        """Whether gradient and difference have different signs, zero being one (n, k, d)."""
-        return ~np.isnan(self.difference) & (np.sign(gradient) != np.sign(self.difference))
+        """Whether gradient and difference have different signs, zero being one, where the difference's is known."""
+        known = np.abs(self.difference) > np.maximum(self.uncertainty, SMALL_SHARE * self._largest())
+        return known & (np.sign(gradient) != np.sign(self.difference))
+
+    @property
+    def resolved(self) -> Numbers:
+        """Whether the differences are good enough to tell errors of `RESOLUTION` (n, k, d).
+
+        Next to a kink (a crossing that comes or goes with a small step of a parameter) only the smallest stencils stay
+        on one side of it, and those are drowned by rounding.
+        """
+        with np.errstate(invalid="ignore"):
+            size = np.maximum(np.abs(self.difference), SMALL_SHARE * self._largest())
+            resolved: Numbers = self.uncertainty <= RESOLUTION * size
+            return resolved
+
+    def _largest(self) -> Numbers:
+        size = np.abs(self.difference)
+        largest: Numbers = np.max(np.where(np.isnan(size), 0.0, size), axis=-1, keepdims=True)
+        return largest
 
     @property
     def trusted(self) -> Numbers:
