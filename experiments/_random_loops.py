@@ -76,8 +76,8 @@ def draw(
 ) -> tuple[dict[str, np.ndarray[Any, Any]], cpjax.State, float]:
     """Parameters, each with a leading axis, `hanging` starts, and the share of all draws whose run is stopped.
 
-    Of eight times as many draws, those whose run is not stopped, in equal parts runs that cross the gate once, twice and
-    more; as far as there are so many, or else more of those that cross once.
+    Of eight times as many draws, those whose run is not stopped, in equal parts runs that cross the gate once, twice
+    and more; as far as there are so many, or else more of those that cross once.
     """
     rng = np.random.default_rng(seed)
     many = 8 * count

@@ -8,9 +8,9 @@ objective is the smooth time outside a wide target (1.5 rad, 0.5 m) over 4 s, at
 
 Pairs whose run is stopped (it slides along the gate) are not drawn; their share is reported. Left out, by a rule that
 was fixed before any comparison and knows nothing of it: runs that cross the gate slower than 0.1 / s, or in which a
-change of the start grows more than ten thousand times. Counted apart, by the differences' own estimate of their
-uncertainty: differences next to a kink, too uncertain to decide. A relative error is relative to the difference, or to a
-thousandth of the largest derivative of that run, if that is more.
+change of the start grows more than ten thousand times. Counted apart: differences next to a kink that are too uncertain
+to decide, by their own estimate. A relative error is relative to the difference, or to a thousandth of the largest
+derivative of that run, if that is more.
 """
 
 from pathlib import Path
@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from _common import run
 from _random_loops import GROUPS, draw
-from matplotlib.figure import Figure
 
 import cpjax
 from cpjax import io
 from cpjax.cli.progress import Report, progress
 from cpjax.show.figures import save_figure
+from cpjax.show.gradients import methods, picture
 from cpjax.study.gradient_audit import GradientAudit, audit_gradients
 
 DURATION, DT = 4.0, 0.5e-3
@@ -65,7 +65,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
             "groups": results,
         },
     )
-    save_figure(out / "gradient_accuracy.png", _picture(audits))
+    save_figure(out / "gradient_accuracy.png", picture(list(audits.values())))
     return total
 
 
@@ -88,7 +88,7 @@ def _summary(audit: GradientAudit) -> dict[str, Any]:
     for i, name in enumerate(audit.names):
         chosen = compared[:, i]
         row: dict[str, Any] = {"compared": int(chosen.sum())}
-        for method, gradient in _methods(audit):
+        for method, gradient in methods(audit):
             errors = audit.errors(gradient)[chosen, -1, i]
             row[method] = {
                 "median": float(np.median(errors)) if errors.size else np.nan,
@@ -108,11 +108,6 @@ def _summary(audit: GradientAudit) -> dict[str, Any]:
     }
 
 
-def _methods(audit: GradientAudit) -> list[tuple[str, np.ndarray[Any, Any]]]:
-    smooth = [(f"smooth {t:g}", g) for t, g in zip(audit.temperatures, audit.smooth, strict=True)]
-    return [("located", audit.located), ("plain", audit.plain), *smooth]
-
-
 def _total(audits: dict[str, GradientAudit]) -> dict[str, Any]:
     found: dict[str, Any] = {
         "runs": sum(len(a.flag) for a in audits.values()),
@@ -120,10 +115,10 @@ def _total(audits: dict[str, GradientAudit]) -> dict[str, Any]:
         "undecided": sum(_undecided(a) for a in audits.values()),
         "compared": sum(int(_compared(a).sum()) for a in audits.values()),
     }
-    for m, (method, _) in enumerate(_methods(next(iter(audits.values())))):
+    for m, (method, _) in enumerate(methods(next(iter(audits.values())))):
         errors, wrong = [], 0
         for audit in audits.values():
-            gradient = _methods(audit)[m][1]
+            gradient = methods(audit)[m][1]
             errors.append(audit.errors(gradient)[:, -1][_compared(audit)])
             wrong += int(np.sum(audit.wrong_signs(gradient)[:, -1][_compared(audit)]))
         every = np.concatenate(errors)
@@ -159,43 +154,6 @@ def _print(results: dict[str, Any], total: dict[str, Any]) -> None:
     for method, row in total.items():
         if isinstance(row, dict):
             print(f"  {method:12} " + ", ".join(f"{key} {value:.3g}" for key, value in row.items()))
-
-
-def _picture(audits: dict[str, GradientAudit]) -> Figure:
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True)
-    colours = {"located": "#0072B2", "plain": "#D55E00"}
-    horizons = next(iter(audits.values())).horizons
-    for method, colour in colours.items():
-        speeds, errors, medians = [], [], []
-        for audit in audits.values():
-            every = np.where(audit.resolved, audit.errors(getattr(audit, method)), np.nan)
-            crossed = audit.trusted & (audit.crossings[:, -1] > 0)
-            speeds.append(audit.speed[crossed, -1])
-            errors.append(np.nanmax(np.where(np.isnan(every[crossed, -1]), 0.0, every[crossed, -1]), axis=-1))
-            medians.append(every[audit.trusted])
-        right.loglog(
-            np.concatenate(speeds),
-            np.maximum(np.concatenate(errors), 1e-13),
-            "o",
-            color=colour,
-            markersize=4,
-            alpha=0.6,
-            label=method,
-        )
-        stacked = [np.concatenate([m[:, k].ravel() for m in medians]) for k in range(len(horizons))]
-        middle = [np.nanmedian(np.maximum(s, 1e-13)) for s in stacked]
-        high = [np.nanquantile(np.maximum(s, 1e-13), 0.95) for s in stacked]
-        left.semilogy(horizons, middle, "o-", color=colour, label=f"{method}, median")
-        left.semilogy(horizons, high, "^--", color=colour, label=f"{method}, 95 % of them below")
-    left.set_xlabel("horizon of the objective [s]")
-    left.set_ylabel("relative error of a derivative")
-    right.set_xlabel("slowest crossing of the gate in the run [1/s]")
-    right.set_title("worst of each run's derivatives", loc="left")
-    for axes in (left, right):
-        axes.grid(alpha=0.3)
-        axes.legend()
-    return figure
 
 
 if __name__ == "__main__":

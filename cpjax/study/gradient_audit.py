@@ -16,12 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from cpjax import io
-from cpjax.controllers import Hybrid, SmoothClip, SmoothHybrid
+from cpjax.controllers import Hybrid, SmoothClip, SmoothHybrid, StateFeedback
 from cpjax.controllers.protocol import Controller, Law
+from cpjax.design.lqr import lqr
+from cpjax.design.placement import place_polynomial
 from cpjax.errors import InputError
 from cpjax.numeric.differences import Differences, central_differences
-from cpjax.plant import CartPole
-from cpjax.pytree import part, pytree
+from cpjax.plant import CartPole, linearize
+from cpjax.pytree import Number, part, pytree, rules
 from cpjax.sim.flags import STOPPED, describe
 from cpjax.sim.metrics import Fold, Sample, TimeOutside
 from cpjax.sim.rollout import measure
@@ -368,6 +370,66 @@ def _scales(names: tuple[str, ...], x: Numbers, given: Mapping[str, float]) -> N
     if zero:
         raise InputError(f"scales[{zero[0]}]", given.get(zero[0]), "given, where a parameter is zero")
     return scale
+
+
+_PLANT = ("cart_mass", "pole_mass", "pole_length", "cart_friction", "pivot_friction")
+_SCALES = {"cart_friction": 0.1, "pivot_friction": 0.01, "hysteresis": 0.1}
+
+
+class Parametrisation(NamedTuple):
+    """What `audit_gradients` takes."""
+
+    build: Build
+    parameters: dict[str, Any]
+    scales: dict[str, float]
+
+
+def parametrise(
+    plant: CartPole, controller: Hybrid, *, Q: Any = None, R: Any = None, poles: Any = None
+) -> Parametrisation:
+    """The numbers of a closed loop by name: of the plant, the swing-up law, the regulator and the gate.
+
+    The regulator's are its gain K; or, if the gain is designed for the plant, the diagonal weights Q (4,) and R, or the
+    characteristic polynomial of the four poles. The law's model of the plant, and the linear model that a gain is
+    designed for, are the plant as given: they do not change with it.
+
+    Raises:
+      InputError: a controller that is not a Hybrid with a StateFeedback.
+    """
+    if not isinstance(controller, Hybrid) or not isinstance(controller.regulator, StateFeedback):
+        raise InputError("controller", controller, "a cpjax.Hybrid with a cpjax.StateFeedback")
+    law, gate, reference = controller.swing_up, controller.gate, controller.regulator.reference
+    parameters: dict[str, Any] = {name: float(getattr(plant, name)) for name in _PLANT}
+    if math.isfinite(float(plant.motor.voltage_limit)):
+        parameters["voltage_limit"] = float(plant.motor.voltage_limit)
+    of_law, of_gate = (
+        [name for name, rule in rules(type(part)).items() if isinstance(rule, Number) and not name.startswith("kick")]
+        for part in (law, gate)
+    )
+    of_law = [name for name in of_law if float(getattr(law, name)) != 0.0]
+    parameters |= {name: float(getattr(law, name)) for name in of_law}
+    parameters |= {name: float(getattr(gate, name)) for name in of_gate}
+    A, B = linearize(plant)
+    if Q is not None:
+        parameters |= {"Q": np.asarray(Q, dtype=np.float64), "R": float(R)}
+    elif poles is not None:
+        parameters["polynomial"] = np.real(np.poly(np.asarray(poles)))[1:]
+    else:
+        parameters["K"] = np.asarray(controller.regulator.K, dtype=np.float64)[0]
+
+    def build(p: Mapping[str, jax.Array]) -> tuple[CartPole, Hybrid]:
+        if "Q" in p:
+            K = lqr(A, B, jnp.diag(p["Q"]), p["R"]).K
+        else:
+            K = place_polynomial(A, B, p["polynomial"]) if "polynomial" in p else p["K"][None]
+        motor = dataclasses.replace(plant.motor, **{n: p[n] for n in ("voltage_limit",) if n in p})
+        changed = dataclasses.replace(plant, **{n: p[n] for n in _PLANT}, motor=motor)
+        swing_up: Any = dataclasses.replace(law, **{n: p[n] for n in of_law})  # type: ignore[type-var]  # a dataclass
+        region: Any = dataclasses.replace(gate, **{n: p[n] for n in of_gate})  # type: ignore[type-var]  # a dataclass
+        return changed, Hybrid(swing_up, StateFeedback(K, reference), region)
+
+    scales = {name: scale for name, scale in _SCALES.items() if parameters.get(name) == 0.0}
+    return Parametrisation(build, parameters, scales)
 
 
 def document(audit: GradientAudit, starts: State, **setting: Any) -> dict[str, Any]:

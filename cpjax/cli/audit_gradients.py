@@ -1,0 +1,94 @@
+"""`cpjax audit-gradients`: can gradients through this loop be trusted? A table, a picture and JSON."""
+
+import argparse
+from typing import Any
+
+from cpjax import io, paper
+from cpjax.cli.options import (
+    CONTROLLER_OPTIONS,
+    PLANT_OPTIONS,
+    Option,
+    add_options,
+    build_controller,
+    build_plant,
+    parse_poles,
+    resolve,
+)
+from cpjax.cli.progress import progress
+from cpjax.cli.tables import print_table
+from cpjax.controllers import Hybrid
+from cpjax.errors import InputError
+from cpjax.starts import START_SETS, sample_starts
+from cpjax.study.gradient_audit import audit_gradients, document, parametrise
+
+OPTIONS = [
+    *PLANT_OPTIONS,
+    *CONTROLLER_OPTIONS,
+    Option("audit", "starts", "set of starts (default hanging)", choices=START_SETS),
+    Option("audit", "count", "number of starts (default 16)", int),
+    Option("audit", "duration", "length of each rollout [s] (default 4)", float),
+    Option("audit", "dt", "integration step [s] (default 0.001)", float),
+]
+
+
+def add_command(commands: Any) -> None:
+    """Declares the command."""
+    text = (
+        "Compares gradients through whole swing-ups, computed in three ways (switches located, switches read once per "
+        "step, smooth surrogates), with finite differences, for each parameter of plant and controller; and says of "
+        "each start whether its gradient can be trusted, and why not. Writes audit_gradients.json and .png."
+    )
+    parser = commands.add_parser("audit-gradients", help="which gradients can be trusted", description=text)
+    add_options(parser, OPTIONS, out="out/audit-gradients")
+    parser.set_defaults(run=run)
+
+
+def run(given: argparse.Namespace) -> int:
+    """Runs the command."""
+    sections = resolve(given, OPTIONS)
+    plant = build_plant(sections["plant"])
+    controller = build_controller(sections["controller"], plant)
+    if not isinstance(controller, Hybrid):
+        raise InputError("controller", type(controller).__name__, "a Hybrid: a regulator behind a gate")
+    setting: dict[str, Any] = {"starts": "hanging", "count": 16, "duration": 4.0, "dt": 1e-3, **sections["audit"]}
+    starts = sample_starts(setting["starts"], setting["count"], seed=given.seed)
+    chosen = parametrise(plant, controller, **_design(sections["controller"]))
+    with progress("audit-gradients") as report:
+        audit = audit_gradients(
+            chosen.build,
+            chosen.parameters,
+            starts,
+            scales=chosen.scales,
+            duration=setting["duration"],
+            dt=setting["dt"],
+            progress=report,
+        )
+    path = given.out / "audit_gradients.json"
+    loop = {"plant": io.encode(plant), "controller": io.encode(controller)}
+    io.write_json(path, document(audit, starts, seed=given.seed, setting=setting, parameters=chosen.parameters, **loop))
+
+    from cpjax.show.figures import save_figure
+    from cpjax.show.gradients import cells, findings, header, picture
+
+    save_figure(given.out / "audit_gradients.png", picture([audit]))
+    title = "Median relative error of derivatives, against finite differences (and how many have the wrong sign)"
+    print_table(title, header(audit), cells(audit), text_columns=1)
+    doubtful = [(str(i), kind, why) for i, (kind, why) in enumerate(audit.verdicts) if kind != "trustworthy"]
+    if doubtful:
+        print_table(
+            "Starts whose gradients are not to be trusted", ("start", "verdict", "why"), doubtful, text_columns=3
+        )
+    print(*findings(audit), sep="\n")
+    print(f"wrote {path} and {given.out / 'audit_gradients.png'}")
+    return 0
+
+
+def _design(given: Any) -> dict[str, Any]:
+    """What the regulator's gain is designed from, if the options say so."""
+    if "K" in given or given.get("file") is not None:
+        return {}
+    if "poles" in given:
+        return {"poles": parse_poles(given["poles"])}
+    if "Q" in given or "R" in given:
+        return {"Q": given.get("Q", paper.Q), "R": given.get("R", paper.R)}
+    return {}

@@ -1,0 +1,112 @@
+"""What an audit of gradients found, as tables, a picture and sentences."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cpjax.study.gradient_audit import GradientAudit
+
+Numbers: TypeAlias = np.ndarray[Any, Any]
+
+_COLOURS: Mapping[str, str] = {"located": "#0072B2", "plain": "#D55E00"}
+_LEAST = 1e-13  # smaller errors are drawn there
+
+
+def methods(audit: GradientAudit) -> list[tuple[str, Numbers]]:
+    """The ways to a derivative by name, and what each found (n, k, d)."""
+    smooth = [(f"smooth {t:g}", g) for t, g in zip(audit.temperatures, audit.smooth, strict=True)]
+    return [("located", audit.located), ("plain", audit.plain), *smooth]
+
+
+def header(audit: GradientAudit) -> list[str]:
+    """Of `cells`."""
+    return ["parameter", "compared", *(name for name, _ in methods(audit))]
+
+
+def cells(audit: GradientAudit) -> list[list[str]]:
+    """For each parameter the median error of each method and, in brackets, how many signs are wrong; a zero where there
+    is a derivative counts as wrong. Over the starts that can be trusted, at the last horizon.
+    """
+    lines = []
+    for i, name in enumerate(audit.names):
+        chosen = audit.trusted & audit.resolved[:, -1, i]
+        found = [(audit.errors(g)[chosen, -1, i], audit.wrong_signs(g)[chosen, -1, i]) for _, g in methods(audit)]
+        texts = [f"{np.median(errors):.1e} ({int(wrong.sum())})" if chosen.any() else "-" for errors, wrong in found]
+        lines.append([name, str(int(chosen.sum())), *texts])
+    return lines
+
+
+def findings(audit: GradientAudit) -> list[str]:
+    """What the audit says, each sentence with its figures."""
+    kinds = [kind for kind, _ in audit.verdicts]
+    counts = ", ".join(f"{kinds.count(k)} {k}" for k in ("trustworthy", "grazing", "chaotic", "stopped"))
+    sentences = [f"Of {len(kinds)} starts: {counts}."]
+    chosen = audit.trusted[:, None] & audit.resolved[:, -1]
+    if not chosen.any():
+        return [*sentences, "No start is left for a comparison."]
+    for name, gradient in methods(audit):
+        errors, wrong = audit.errors(gradient)[:, -1][chosen], audit.wrong_signs(gradient)[:, -1][chosen]
+        sentences.append(
+            f"{name.capitalize()}: relative errors of {np.median(errors):.1e} in the median and {np.max(errors):.1e} "
+            f"at worst, {int(wrong.sum())} of {errors.size} derivatives with the wrong sign."
+        )
+    undecided = int(np.sum(audit.trusted[:, None] & ~audit.resolved[:, -1]))
+    if undecided:
+        sentences.append(f"{undecided} derivatives were not compared: next to a kink no difference is certain enough.")
+    return sentences
+
+
+def picture(audits: Sequence[GradientAudit]) -> Figure:
+    """Errors against the horizon and against the slowest crossing, and growth of sensitivity with the horizon."""
+    figure = Figure(figsize=(13, 4.4), layout="constrained")
+    by_horizon, by_speed, growth = figure.subplots(1, 3)
+    for method, colour in _COLOURS.items():
+        errors = [np.where(a.resolved, a.errors(getattr(a, method)), np.nan) for a in audits]
+        _by_horizon(by_horizon, audits, errors, method, colour)
+        speeds, worst = [], []
+        for audit, error in zip(audits, errors, strict=True):
+            crossed = audit.trusted & (audit.crossings[:, -1] > 0) & audit.resolved[:, -1].any(axis=-1)
+            speeds.append(audit.speed[crossed, -1])
+            worst.append(np.nanmax(error[crossed, -1], axis=-1, initial=0.0))
+        by_speed.loglog(
+            np.concatenate(speeds),
+            np.maximum(np.concatenate(worst), _LEAST),
+            "o",
+            color=colour,
+            markersize=4,
+            alpha=0.6,
+        )
+    by_horizon.set_xlabel("horizon of the objective [s]")
+    by_horizon.set_ylabel("relative error of a derivative")
+    by_horizon.set_title("median, and what 95 % stay below", loc="left")
+    by_horizon.legend()
+    by_speed.set_xlabel("slowest crossing of the gate [1/s]")
+    by_speed.set_title("worst derivative of each run", loc="left")
+    by_speed.sharey(by_horizon)
+    growths = np.concatenate([a.growth for a in audits])
+    growth.semilogy(audits[0].horizons, growths.T, color="#009E73", alpha=min(1.0, 8.0 / len(growths)))
+    growth.semilogy(audits[0].horizons, np.nanmedian(growths, axis=0), "o-", color="#000000", label="median")
+    growth.set_xlabel("time [s]")
+    growth.set_ylabel("norm of d state / d start")
+    growth.set_title("what becomes of a change of the start", loc="left")
+    growth.legend()
+    for axes in (by_horizon, by_speed, growth):
+        axes.grid(alpha=0.3)
+    return figure
+
+
+def _by_horizon(
+    axes: Axes, audits: Sequence[GradientAudit], errors: Sequence[Numbers], method: str, colour: str
+) -> None:
+    horizons = audits[0].horizons
+    middle, high = [], []
+    for k in range(len(horizons)):
+        every = np.concatenate([e[a.trusted, k].ravel() for a, e in zip(audits, errors, strict=True)])
+        every = every[np.isfinite(every)]
+        middle.append(max(float(np.median(every)), _LEAST) if every.size else np.nan)
+        high.append(max(float(np.quantile(every, 0.95)), _LEAST) if every.size else np.nan)
+    axes.semilogy(horizons, middle, "o-", color=colour, label=method)
+    axes.semilogy(horizons, high, "^--", color=colour)
