@@ -124,10 +124,10 @@ class GradientAudit:
 
     @property
     def verdicts(self) -> list[tuple[str, str]]:
-        """For each start: trustworthy, grazing, chaotic or stopped; and why. At the last horizon."""
+        """For each start: trustworthy, grazing, chaotic or stopped; and why. Over all horizons."""
         found = []
         for flag, speed, growth, crossings in zip(
-            self.flag, self.speed[:, -1], self.growth[:, -1], self.crossings[:, -1], strict=True
+            self.flag, self.speed[:, -1], np.max(self.growth, axis=1), self.crossings[:, -1], strict=True
         ):
             if flag & STOPPED:
                 found.append(("stopped", describe(flag)))
