@@ -145,11 +145,11 @@ class ContinuousReference:
         self.ends = np.array(ends)
         self.switch_times = np.array([swing.t[-1] for swing in self.swings])
 
-    def errors(self, dt):
+    def errors(self, dt, switching="per_step"):
         """By start: the largest error before the switch, and the error at the end."""
         before, after = [], []
         for start, swing, end in zip(self.starts, self.swings, self.ends, strict=True):
-            run = cpjax.rollout(POINT_BOB, self.ours, start, duration=self.duration, dt=dt, switching="per_step")
+            run = cpjax.rollout(POINT_BOB, self.ours, start, duration=self.duration, dt=dt, switching=switching)
             error, _ = error_before_the_switch(run, swing, dt)
             before.append(error)
             after.append(np.max(np.abs(columns(run.state)[-1] - end)))
@@ -187,3 +187,22 @@ def test_the_clip_before_the_switch_is_of_second_order(errors_by_step):
     steps, before, _ = errors_by_step
     assert fitted_order(steps, before.mean(axis=1)) == pytest.approx(2.0, abs=0.2)
     assert before[-1].max() <= 1e-5
+
+
+@pytest.fixture(scope="module")
+def located_errors_by_step(continuous):
+    steps = np.array([8e-3, 4e-3, 2e-3, 0.5e-3])
+    before, after = zip(*(continuous.errors(float(dt), "located") for dt in steps), strict=True)
+    return steps, np.array(before), np.array(after)
+
+
+def test_located_switching_is_of_fourth_order_across_clip_and_switch(located_errors_by_step):
+    steps, before, after = located_errors_by_step
+    assert fitted_order(steps[:3], before.mean(axis=1)[:3]) >= 3.7
+    assert fitted_order(steps[:3], after.mean(axis=1)[:3]) >= 3.7
+
+
+def test_located_the_loop_is_scipys_through_the_first_catch(located_errors_by_step):
+    _, before, after = located_errors_by_step
+    assert before[-1].max() <= 1e-8
+    assert after[-1].max() <= 1e-8
