@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from cpjax.numeric.trigonometry import wrap_angle
+from cpjax.numeric.trigonometry import sin_cos, wrap_angle
 from cpjax.pytree import Scalar, number, pytree
 from cpjax.sim.flags import STOPPED
 from cpjax.state import State
@@ -89,8 +89,9 @@ class Metrics:
 class TimeOutside:
     """The fold that yields a smooth and bounded stand-in for the settling time [s].
 
-    The integral of 1 - exp(-(theta / angle_width)^2 / 2 - ((x - reference_x) / position_width)^2 / 2), theta wrapped:
-    the time spent farther from upright in place than the widths, roughly. By the trapezoidal rule.
+    The integral of 1 - exp(-(1 - cos theta) / angle_width^2 - ((x - reference_x) / position_width)^2 / 2): the time
+    spent farther from upright in place than the widths, roughly. By the trapezoidal rule. The cosine makes it smooth at
+    theta = pi too, where theta modulo a turn, and what a sum over samples makes of it, has a kink.
     """
 
     angle_width: Scalar = number("rad", "of the target", default=0.2, above=0.0)
@@ -109,9 +110,9 @@ class TimeOutside:
         return memory[0]
 
     def _outside(self, sample: Sample) -> jax.Array:
-        angle = wrap_angle(sample.state.theta) / self.angle_width
+        _, cos = sin_cos(sample.state.theta)
         away = (sample.state.x - self.reference_x) / self.position_width
-        return 1.0 - jnp.exp(-0.5 * (angle * angle + away * away))
+        return 1.0 - jnp.exp(-(1.0 - cos) / (self.angle_width * self.angle_width) - 0.5 * away * away)
 
 
 class _Memory(NamedTuple):

@@ -150,7 +150,8 @@ class _Probe(NamedTuple):
     crossings: jax.Array
     speed: jax.Array
     path: jax.Array
-    """A number made of the sequence of crossings, of gate and supply: equal for equal sequences."""
+    """A number made of the sequence of crossings, of gate and supply, and of their steps: equal for equal sequences.
+    Where a crossing passes a sample, the samples' states, and what is summed of them, have a (small) kink."""
 
 
 class _Memory(NamedTuple):
@@ -168,6 +169,8 @@ class _Prober:
     objective: Fold = part("a fold", "init", "update", "finish")
     horizons: Any = None
     """(k,) [s]."""
+    dt: Any = None
+    """[s]."""
 
     def init(self, sample: Sample) -> _Memory:
         k, dtype = self.horizons.shape[0], sample.time.dtype
@@ -187,11 +190,9 @@ class _Prober:
         at_gate = sample.crossing == 3
         crossings = memory.crossings + at_gate.astype(jnp.int32)
         speed = jnp.where(at_gate, jnp.minimum(memory.speed, sample.crossing_speed), memory.speed)
-        path = jnp.where(
-            sample.crossing > 0,
-            memory.path * jnp.uint32(2654435761) + sample.crossing.astype(jnp.uint32),
-            memory.path,
-        )
+        step = jnp.floor(sample.time / self.dt).astype(jnp.uint32)
+        mixed = (memory.path + sample.crossing.astype(jnp.uint32)) * jnp.uint32(2654435761) + step
+        path = jnp.where(sample.crossing > 0, mixed, memory.path)
         now = _Probe(self.objective.finish(objective, sample), sample.state.vector(), crossings, speed, path)
         within = sample.time <= self.horizons
         probe = jax.tree.map(
@@ -243,7 +244,9 @@ def audit_gradients(
     n = int(jnp.shape(starts.x)[0])
     names, x, shapes = _vector(parameters, n, each)
     scale = _scales(names, x, scales or {})
-    fold = _Prober(TimeOutside() if objective is None else objective, jnp.asarray(ends + 0.25 * dt, dtype))
+    fold = _Prober(
+        TimeOutside() if objective is None else objective, jnp.asarray(ends + 0.25 * dt, dtype), jnp.asarray(dt, dtype)
+    )
 
     def made(vector: jax.Array) -> tuple[CartPole, Hybrid]:
         plant, controller = build(_tree(vector, shapes))
