@@ -39,6 +39,14 @@ def test_the_python_of_the_design_page_runs():
     assert names["factors"].poles().shape == (4,)
 
 
+def test_the_python_of_the_page_on_gradients_runs(capsys):
+    page = (ROOT / "docs" / "gradients.md").read_text()
+    exec(compile("\n".join(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)), "gradients.md", "exec"), {})
+    value, slope = map(float, capsys.readouterr().out.split())
+    assert 0.5 < value < 3.0
+    assert abs(slope) > 1e-4
+
+
 def test_the_cpjax_commands_of_the_pages_are_understood():
     found = [c for page in PAGES for c in commands(page) if c.startswith("cpjax ")]
     assert len(found) >= 5
