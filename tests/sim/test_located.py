@@ -321,44 +321,64 @@ def test_no_value_and_no_gradient_is_nan_at_the_ugly_points(dtype, gate):
         assert np.all(np.isfinite(leaf)), jax.tree_util.keystr(path)
 
 
+@pytree
+class OutsideAndFlag:
+    """Time outside the target, and how the run ended."""
+
+    outside: cpjax.TimeOutside = cpjax.TimeOutside(1.5, 0.5)
+
+    def init(self, sample):
+        return self.outside.init(sample)
+
+    def update(self, memory, sample):
+        return self.outside.update(memory, sample)
+
+    def finish(self, memory, last):
+        return self.outside.finish(memory, last), last.flag
+
+
+LOWEST = (0.3, 0.3, 0.05, 0.3, 1.0, 1.0, 10.0, 1.0, 3.0, 0.3, -0.5, -2.0, -math.pi, -8.0)
+HIGHEST = (30.0, 6.0, 1.5, 10.0, 300.0, 100.0, 1000.0, 100.0, 30.0, 1.5, 0.5, 2.0, math.pi, 8.0)
+
+
 def random_draws(count, seed, dtype):
-    """States anywhere, and parameters over more than a decade."""
+    """Parameters over more than a decade, gains of either sign, and states anywhere."""
     rng = np.random.default_rng(seed)
-    spread = lambda low, high: np.exp(rng.uniform(math.log(low), math.log(high), count))  # noqa: E731
-    x = np.stack(
-        [
-            spread(0.3, 30.0),
-            spread(0.3, 6.0),
-            spread(0.05, 1.5),
-            spread(0.3, 10.0),
-            -spread(1.0, 300.0),
-            spread(10.0, 1000.0),
-            spread(3.0, 30.0),
-            spread(0.3, 1.5),
-            rng.uniform(-math.pi, math.pi, count),
-        ],
-        axis=1,
-    )
-    return jnp.asarray(x, dtype=dtype)
+    low, high = np.array(LOWEST), np.array(HIGHEST)
+    parameters = np.exp(rng.uniform(np.log(low[:10]), np.log(high[:10]), (count, 10)))
+    parameters[:, 4:8] *= np.array([-1.0, -1.0, 1.0, 1.0])
+    states = rng.uniform(low[10:], high[10:], (count, 4))
+    return jnp.asarray(np.concatenate([parameters, states], axis=1), dtype=dtype)
 
 
-def check_random_draws(count, dtype, chunk=2000):
-    def both(x):
-        return jax.value_and_grad(lambda x: cost(x, dt=2e-3, duration=1.0))(x)
+def outcome(x):
+    energy_gain, damping, half_angle, rate, *rest = x[:10]
+    K, limit, length = jnp.stack(rest[:4])[None], rest[4], rest[5]
+    plant = CartPole(pole_length=length, motor=Motor(voltage_limit=limit))
+    law = EnergySwingUp(plant, energy_gain=energy_gain, cart_stiffness=4.0, cart_damping=damping)
+    controller = Hybrid(law, StateFeedback(K), AngleRateGate(half_angle, rate))
+    start = State.from_vector(x[10:])
+    return cpjax.measure(plant, controller, start, duration=1.0, dt=2e-3, switching="located", metrics=OutsideAndFlag())
 
-    batched = jax.jit(jax.vmap(both))
+
+def check_random_draws(count, dtype, chunk):
+    batched = jax.jit(jax.vmap(jax.value_and_grad(outcome, has_aux=True)))
+    flags = []
     for begin in range(0, count, chunk):
-        value, gradient = batched(random_draws(chunk, begin, dtype))
+        (value, flag), gradient = batched(random_draws(chunk, begin, dtype))
         assert np.all(np.isfinite(value))
         assert np.all(np.isfinite(gradient))
+        flags.append(np.asarray(flag))
+    lost = np.concatenate(flags) & (Flag.RUNAWAY | Flag.NON_FINITE)
+    assert np.mean(lost != 0) <= 0.01
 
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_no_value_and_no_gradient_is_nan_at_random_points(dtype):
-    check_random_draws(400, dtype, chunk=400)
+    check_random_draws(500, dtype, chunk=500)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_no_value_and_no_gradient_is_nan_at_a_hundred_thousand_random_points(dtype):
-    check_random_draws(100_000, dtype)
+    check_random_draws(100_000, dtype, chunk=2000)
