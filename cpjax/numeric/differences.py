@@ -23,7 +23,8 @@ def central_differences(
     """The derivative at 0 of a function of one variable, or of many such functions at once.
 
     Extrapolates the central differences of all consecutive steps to step 0, and returns, of all the extrapolations, the
-    one that changes least with one step more or less: large steps are off by curvature, small ones by rounding.
+    one that changes least with one step more or less: large steps are off by curvature, small ones by rounding. Of many
+    changes some are small by chance, so none counts for less than the rounding of the function's values can do.
 
     Args:
       function: takes a step h and returns the function at +h and at -h, arrays of one shape (...).
@@ -38,10 +39,11 @@ def central_differences(
         first = (above - below) / (2.0 * step)
         if valid is not None:
             first = np.where(valid(float(step)), first, np.nan)
+        rounding = 16.0 * np.finfo(np.float64).eps * np.maximum(np.abs(above), np.abs(below)) / step
         row = [first]
         for order, coarse in enumerate(rows[-1] if rows else [], start=1):
             finer = row[-1] + (row[-1] - coarse) / (factor**order - 1.0)
-            change = np.maximum(np.abs(finer - row[-1]), np.abs(finer - coarse))
+            change = np.maximum(np.maximum(np.abs(finer - row[-1]), np.abs(finer - coarse)), rounding)
             row.append(finer)
             better = change < best.uncertainty
             best = Differences(np.where(better, finer, best.derivative), np.where(better, change, best.uncertainty))
