@@ -19,8 +19,8 @@ class Flag(enum.IntFlag):
     """A parameter or the next state was NaN or infinite. The state was held at its last finite value."""
 
     CHATTERING = 4
-    """The mode changed at CHATTER_LENGTH control instants in a row, or, located, so many times within one step. The run
-    went on; a gate wants hysteresis."""
+    """The mode changed at CHATTER_LENGTH control instants in a row, or, located, gate and clip so many times within one
+    step. The run went on; a gate wants hysteresis."""
 
     OVERFLOW = 8
     """Located switching used up its spare steps, by many crossings or by chattering. The state was held there."""

@@ -48,7 +48,14 @@ def gradients(
         raise InputError("direction", direction, "reverse or forward")
     if isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1:
         raise InputError("chunk", chunk, "a whole number of starts, at least 1")
+    for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):
+        if not (isinstance(leaf, float) or jnp.issubdtype(getattr(leaf, "dtype", int), jnp.floating)):
+            name = f"parameters{jax.tree_util.keystr(path)}"
+            raise InputError(name, leaf, "a float or a floating-point array")
     starts, _ = checked_start(starts, "starts", batched=True)
+    shape = jax.eval_shape(objective, parameters, jax.tree.map(lambda column: column[0], starts))
+    if getattr(shape, "shape", None) != ():
+        raise InputError("objective", objective, f"a function that returns one number, not {shape}")
     found: Gradients = _gradients(parameters, starts, objective=objective, direction=direction, chunk=chunk)
     return found
 

@@ -18,14 +18,14 @@ from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
 from cpjax.sim.stepper import ClosedLoop
-from cpjax.sim.switching import LANDED, Clock, iterate, pick, start_clock
+from cpjax.sim.switching import LANDED, RUN, Motion, iterate, pick, start_motion
 from cpjax.state import ANGLE_LIMIT, RUNAWAY_LIMIT, State
 
 
 class _Loop(NamedTuple):
     """The scan's carry."""
 
-    clock: Clock
+    motion: Motion
     flag: jax.Array
 
 
@@ -35,21 +35,21 @@ def simulate(
     """The samples that are kept (None if none are), the last one, and what the fold made of all of them."""
     system, integrator = ClosedLoop(plant, controller), INTEGRATORS[settings.integrator]
     steps, iterations = settings.steps, settings.steps + settings.spare_steps
-    clock = start_clock(system, (start.x, start.theta), (start.x_dot, start.theta_dot), system.start_mode(start), dt)
-    loop = _Loop(clock, unknown((start, plant, controller)))
-    first = _sample(loop, clock, dt)
+    motion = start_motion(system, (start.x, start.theta), (start.x_dot, start.theta_dot), system.start_mode(start), dt)
+    loop = _Loop(motion, unknown((start, plant, controller)))
+    first = _sample(loop, motion, dt)
     memory = fold.update(fold.init(first), first)
 
     def body(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], tuple[Sample, jax.Array] | None]:
         before, memory = carry
         loop, reached = _advance(system, integrator, before, dt, steps, iterations - index)
-        sample = _sample(loop, before.clock, dt)
+        sample = _sample(loop, before.motion, dt)
         memory = jax.tree.map(lambda new, old: jnp.where(reached, new, old), fold.update(memory, sample), memory)
-        return (loop, memory), (None if settings.save_every is None else (sample, loop.clock.passed))
+        return (loop, memory), (None if settings.save_every is None else (sample, loop.motion.passed))
 
     carry, kept = scan(body, (loop, memory), jnp.arange(iterations, dtype=jnp.int32), settings.checkpoint)
     loop, memory = carry
-    last = _sample(loop, loop.clock, dt)
+    last = _sample(loop, loop.motion, dt)
     samples = None
     if kept is not None:
         samples, passed = kept
@@ -60,18 +60,18 @@ def simulate(
     return samples, last, fold.finish(memory, last)
 
 
-def _sample(loop: _Loop, before: Clock, dt: jax.Array) -> Sample:
-    """At the last point that was reached; `before` is the clock an iteration earlier."""
-    clock = loop.clock
-    landed = before.stage == LANDED
+def _sample(loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
+    """At the last point that was reached; `before` is the motion an iteration earlier."""
+    motion = loop.motion
+    landed = (before.stage == LANDED) & ((loop.flag & STOPPED) == 0)
     return Sample(
-        time=clock.passed.astype(dt.dtype) * dt + clock.offset,
-        elapsed=clock.elapsed,
-        state=State(clock.q[0], clock.v[0], clock.q[1], clock.v[1]),
-        voltage=clock.seen.output,
-        voltage_before=jnp.where(landed, before.seen.output, clock.seen.output),
-        mode=clock.mode.law,
-        cart_acceleration=jnp.asarray(clock.seen.acceleration[0]),
+        time=motion.passed.astype(dt.dtype) * dt + motion.offset,
+        elapsed=motion.elapsed,
+        state=State(motion.q[0], motion.v[0], motion.q[1], motion.v[1]),
+        voltage=motion.seen.output,
+        voltage_before=jnp.where(landed, before.seen.output, motion.seen.output),
+        mode=motion.mode.law,
+        cart_acceleration=jnp.asarray(motion.seen.acceleration[0]),
         flag=loop.flag,
         crossing=jnp.where(landed, before.guard + 1, 0),
         crossing_speed=jnp.where(landed, -pick(before.slopes, before.guard), 0.0),
@@ -87,28 +87,28 @@ def _advance(
     As on the other path (`per_step.py`), a step that is about to go wrong is taken from upright rest and dropped, so
     that no infinity of a branch that is not taken reaches a derivative.
     """
-    clock = loop.clock
-    stopped, ended = (loop.flag & STOPPED) != 0, clock.passed >= steps
-    acceleration = clock.seen.acceleration
-    ahead = jnp.maximum(jnp.abs(clock.v[0] + dt * acceleration[0]), jnp.abs(clock.v[1] + dt * acceleration[1]))
+    motion = loop.motion
+    stopped, ended = (loop.flag & STOPPED) != 0, motion.passed >= steps
+    acceleration = motion.seen.acceleration
+    ahead = jnp.maximum(jnp.abs(motion.v[0] + dt * acceleration[0]), jnp.abs(motion.v[1] + dt * acceleration[1]))
     going = ~stopped & ~ended & (ahead <= RUNAWAY_LIMIT)
-    moving = (clock.q, clock.v, clock.seen, clock.slopes, clock.offset, clock.step)
-    safe = jax.tree.map(lambda x: jnp.where(going, x, 0.0), moving)
-    names = ("q", "v", "seen", "slopes", "offset", "step")
-    after, reached = iterate(system, integrator, clock._replace(**dict(zip(names, safe, strict=True))), dt)
+    safe = jax.tree.map(lambda x: jnp.where(going, x, 0), motion)
+    after, reached = iterate(system, integrator, safe, dt)
     fastest = jnp.maximum(jnp.abs(after.v[0]), jnp.abs(after.v[1]))
     within = (jnp.maximum(jnp.abs(after.q[0]), fastest) <= RUNAWAY_LIMIT) & (jnp.abs(after.q[1]) <= ANGLE_LIMIT)
     in_time = left > steps - after.passed
     good = going & within & in_time
     finite = jnp.isfinite(ahead + after.q[0] + after.v[0] + after.q[1] + after.v[1])
-    reason = jnp.where(in_time, jnp.where(finite, int(Flag.RUNAWAY), int(Flag.NON_FINITE)), int(Flag.OVERFLOW))
+    lost = jnp.where(finite, int(Flag.RUNAWAY), int(Flag.NON_FINITE))
+    reason = jnp.where(going & within & finite, int(Flag.OVERFLOW), lost)
     chatter = jnp.where(good & (after.crossings >= CHATTER_LENGTH), int(Flag.CHATTERING), 0)
     flag = loop.flag | jnp.where(stopped | ended | good, 0, reason) | chatter
     # A run that is held passes one grid point an iteration.
-    held = clock._replace(
-        passed=clock.passed + (~ended).astype(clock.passed.dtype),
-        offset=jnp.zeros_like(clock.offset),
-        elapsed=jnp.where(ended, clock.elapsed, 0.0),
+    held = motion._replace(
+        passed=motion.passed + (~ended).astype(motion.passed.dtype),
+        offset=jnp.zeros_like(motion.offset),
+        elapsed=jnp.where(ended, motion.elapsed, 0.0),
+        stage=jnp.full_like(motion.stage, RUN),
     )
-    clock = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, held)
-    return _Loop(clock, flag), (good & reached) | (~good & ~ended)
+    motion = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, held)
+    return _Loop(motion, flag), (good & reached) | (~good & ~ended)

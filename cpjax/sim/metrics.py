@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from cpjax.numeric.trigonometry import sin_cos, wrap_angle
 from cpjax.pytree import Scalar, number, pytree
@@ -39,6 +40,10 @@ class Sample(NamedTuple):
     """What was located here, int32: 0 nothing, 1 and 2 the upper and the lower end of the supply, 3 the gate."""
     crossing_speed: jax.Array
     """How fast that guard fell [1/s]: of the voltage relative to the limit, or of the gate's margin. 0 elsewhere."""
+
+
+GATE_CROSSING = 3
+"""`Sample.crossing` at a located change of the controller's mode."""
 
 
 class Fold(Protocol):
@@ -174,8 +179,8 @@ class ProtocolMetrics:
     def finish(self, memory: _Memory, last: Sample) -> Metrics:
         stopped = (last.flag & STOPPED) != 0
         settling_time = jnp.where(stopped, math.inf, memory.entered)
-        # Both times are whole numbers of steps; half a step of slack keeps rounding out of the comparison.
-        in_time = settling_time <= last.time - self.hold + 0.5 * last.elapsed
+        rounding = 64.0 * float(np.finfo(last.time.dtype).eps) * last.time
+        in_time = settling_time <= last.time - self.hold + rounding
         return Metrics(
             success=in_time & (memory.cart_travel <= self.track_limit),
             settling_time=settling_time,

@@ -73,13 +73,15 @@ def rollout(
       control_period: of the sampled clock, a whole number of steps [s]; by default one step.
       switching: "per_step": the mode is read at the control instants and kept in between. "located", on the continuous
         clock: changes of mode, and the moments at which the voltage reaches the limit or leaves it, are found inside
-        their steps, and derivatives know that they move (see docs/gradients.md).
+        their steps, and first derivatives know that they move (see docs/gradients.md). In each mode the law has to be
+        continuous in the state; a StateFeedback alone is not, at theta = pi.
       integrator: a key of `cpjax.sim.integrators.INTEGRATORS`.
       save_every: keep every so many steps; must divide the number of steps.
       spare_steps: of located switching, whose crossings take four steps each: the most that they may take together. A
         run that needs more is stopped and flagged. By default 64 and a sixteenth of the steps.
       checkpoint: what reverse mode remembers: the state at "every_step", or at the ends of "segments" of about
-        sqrt(n) steps, which takes less memory and a little more time. Nothing else depends on it.
+        sqrt(n) steps, which takes less memory and a little more time. Nothing else depends on it. (With switching per
+        step and `save_every` above 1 it remembers the saved states, whatever is asked for.)
       metrics: a fold over all steps; by default `ProtocolMetrics()`.
 
     Raises:

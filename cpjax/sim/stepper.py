@@ -68,6 +68,10 @@ def _integrate(
     return _state(q, v)
 
 
+UPPER, LOWER, GATE = 0, 1, 2
+"""Numbers of the closed loop's guards: the ends of the supply, and the controller's margin."""
+
+
 class Mode(NamedTuple):
     """In which the closed loop is smooth."""
 
@@ -95,7 +99,7 @@ class ClosedLoop(NamedTuple):
         guards = (
             jnp.where(mode.clip > 0, relative - 1.0, 1.0 - relative),
             jnp.where(mode.clip < 0, -1.0 - relative, 1.0 + relative),
-            self.controller.margin(state, mode.law),
+            self._of_state(self.controller.margin(state, mode.law), state),
         )
         voltage = jnp.where(mode.clip == 0, demand, jnp.where(mode.clip > 0, limit, -limit))
         sin, cos = sin_cos(q[1])
@@ -103,10 +107,13 @@ class ClosedLoop(NamedTuple):
         return Observation(acceleration, guards, voltage)
 
     def jump(self, q: Pair, v: Pair, mode: Mode, guard: jax.Array) -> tuple[Pair, Pair, Mode]:
-        law = jnp.where(guard == 2, self.controller.successor(mode.law), mode.law)
-        end = jnp.where(guard == 0, 1, -1)
-        clip = jnp.where(mode.clip == 0, end, 0)
-        return q, v, Mode(law, jnp.where(guard == 2, self._clip(_state(q, v), law), clip).astype(mode.clip.dtype))
+        state = _state(q, v)
+        law = jnp.where(guard == GATE, self.controller.successor(mode.law), mode.law)
+        now = self._clip(state, law)
+        # On the limit itself rounding has the sign. A demand that has jumped past the other limit is beyond that one.
+        inside = jnp.where(now == -mode.clip, now, 0)
+        clip = jnp.where(mode.clip == 0, jnp.where(guard == UPPER, 1, -1), inside)
+        return q, v, Mode(law, jnp.where(guard == GATE, now, clip).astype(mode.clip.dtype))
 
     def start_mode(self, start: State) -> Mode:
         """At the start of a rollout."""
@@ -118,7 +125,10 @@ class ClosedLoop(NamedTuple):
         return (demand > limit).astype(jnp.int32) - (demand < -limit).astype(jnp.int32)
 
     def _demand(self, state: State, law: jax.Array) -> jax.Array:
-        return jnp.asarray(self.controller.mode_voltage(state, law), dtype=jnp.asarray(state.x).dtype)
+        return self._of_state(self.controller.mode_voltage(state, law), state)
+
+    def _of_state(self, value: Scalar, state: State) -> jax.Array:
+        return jnp.asarray(value, dtype=jnp.asarray(state.x).dtype)
 
 
 def _state(q: Pair, v: Pair) -> State:

@@ -23,9 +23,9 @@ from cpjax.design.placement import place_polynomial
 from cpjax.errors import InputError
 from cpjax.numeric.differences import Differences, central_differences
 from cpjax.plant import CartPole, linearize
-from cpjax.pytree import Number, part, pytree, rules
+from cpjax.pytree import Number, is_traced, part, pytree, rules
 from cpjax.sim.flags import STOPPED, describe
-from cpjax.sim.metrics import Fold, Sample, TimeOutside
+from cpjax.sim.metrics import GATE_CROSSING, Fold, Sample, TimeOutside
 from cpjax.sim.rollout import measure
 from cpjax.sim.settings import check_settings
 from cpjax.state import NAMES, State, checked_start
@@ -187,14 +187,14 @@ class _Prober:
 
     def update(self, memory: _Memory, sample: Sample) -> _Memory:
         objective = self.objective.update(memory.objective, sample)
-        at_gate = sample.crossing == 3
+        at_gate = sample.crossing == GATE_CROSSING
         crossings = memory.crossings + at_gate.astype(jnp.int32)
         speed = jnp.where(at_gate, jnp.minimum(memory.speed, sample.crossing_speed), memory.speed)
         step = jnp.floor(sample.time / self.dt).astype(jnp.uint32)
         mixed = (memory.path + sample.crossing.astype(jnp.uint32)) * jnp.uint32(2654435761) + step
         path = jnp.where(sample.crossing > 0, mixed, memory.path)
         now = _Probe(self.objective.finish(objective, sample), sample.state.vector(), crossings, speed, path)
-        within = sample.time <= self.horizons
+        within = (sample.time <= self.horizons) & (sample.crossing == 0)  # horizons are grid points
         probe = jax.tree.map(
             lambda new, old: jnp.where(within.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), now, memory.probe
         )
@@ -226,7 +226,8 @@ def audit_gradients(
       starts: a State of arrays (n,).
       duration: of the rollouts [s].
       dt: their step [s].
-      horizons: where the objective is read [s]; by default quarters of the duration.
+      horizons: where the objective is read, rising, each a whole number of steps [s]; by default quarters of the
+        duration.
       objective: a fold whose result is a number; `TimeOutside()` by default.
       scales: what counts as a whole change of a parameter; by default its value.
       temperatures: of the smooth surrogates: of the gate's margin, and of the clip relative to the supply.
@@ -238,9 +239,12 @@ def audit_gradients(
     """
     starts, dtype = checked_start(starts, "starts", batched=True)
     check_settings(duration, dt, "continuous", None, "located", "rk4", None)
-    ends = duration * np.arange(1, 5) / 4.0 if horizons is None else np.asarray(horizons, dtype=np.float64)
-    if ends.ndim != 1 or ends.size == 0 or not (np.all(ends > 0) and np.all(ends <= duration * (1 + 1e-9))):
-        raise InputError("horizons", horizons, f"times above 0 s and at most the duration, {duration:g} s")
+    if dtype != jnp.float64:
+        raise InputError("starts", f"State of {dtype}", "of float64: float32 has too few digits for differences")
+    ends = _horizons(horizons, duration, dt)
+    for temperature in temperatures:
+        if isinstance(temperature, (bool, str)) or not 0.0 < temperature < math.inf:
+            raise InputError("temperatures", temperature, "finite numbers above 0")
     n = int(jnp.shape(starts.x)[0])
     names, x, shapes = _vector(parameters, n, each)
     scale = _scales(names, x, scales or {})
@@ -258,22 +262,27 @@ def audit_gradients(
         plant, controller = made(vector)
         law: Any = controller
         if temperature is not None:
-            smooth = SmoothHybrid(controller.swing_up, controller.regulator, controller.gate, temperature)
+            law = SmoothHybrid(controller.swing_up, controller.regulator, controller.gate, temperature)
             limit = plant.motor.voltage_limit
-            law = SmoothClip(smooth, limit, temperature * limit)
+            if is_traced(limit) or np.isfinite(limit):
+                law = SmoothClip(law, limit, temperature * limit)
         found: tuple[_Probe, jax.Array] = measure(
             plant, law, start, duration=duration, dt=dt, switching=switching, metrics=fold
         )
         return found
 
-    def slopes(switching: Any, temperature: float | None = None) -> tuple[Any, Any, _Probe, Numbers]:
+    def jacobians(switching: Any, temperature: float | None = None, *, arguments: tuple[int, ...] = (0,)) -> Any:
         def of_all(vector: jax.Array, start: jax.Array) -> tuple[Any, Any]:
             found, flag = probe(vector, State.from_vector(start), switching, temperature)
             return (found.value, found.state), (found, flag)
 
-        jacobian = jax.jit(jax.vmap(jax.jacfwd(of_all, argnums=(0, 1), has_aux=True)))
-        (value, state), (found, flag) = jacobian(jnp.asarray(x, dtype), starts.vector())
-        return np.asarray(value[0], np.float64) * scale[:, None], np.asarray(state[1]), found, np.asarray(flag)
+        return jax.jit(jax.vmap(jax.jacfwd(of_all, argnums=arguments, has_aux=True)))(
+            jnp.asarray(x, dtype), starts.vector()
+        )
+
+    def slopes(switching: Any, temperature: float | None = None) -> Numbers:
+        (value, _), _ = jacobians(switching, temperature)
+        return np.asarray(value[0]) * scale[:, None]
 
     parts = 2 + len(temperatures) + len(_STEPS)
     done = 0
@@ -285,13 +294,14 @@ def audit_gradients(
         done += 1
 
     report("located switching")
-    located, by_start, found, flag = slopes("located")
+    (value, state), (found, flag) = jacobians("located", arguments=(0, 1))
+    located = np.asarray(value[0]) * scale[:, None]
     report("switching per step")
-    plain, *_ = slopes("per_step")
+    plain = slopes("per_step")
     smooth = []
     for temperature in temperatures:
         report(f"smooth, temperature {temperature:g}")
-        smooth.append(slopes("per_step", float(temperature))[0])
+        smooth.append(slopes("per_step", float(temperature)))
     difference = _differences(probe, x, starts, scale, found, report)
     report("done")
     return GradientAudit(
@@ -306,8 +316,8 @@ def audit_gradients(
         uncertainty=difference.uncertainty,
         crossings=np.asarray(found.crossings),
         speed=np.asarray(found.speed),
-        growth=np.linalg.norm(by_start, ord=2, axis=(-2, -1)),
-        flag=flag,
+        growth=np.linalg.norm(np.asarray(state[1]), ord=2, axis=(-2, -1)),
+        flag=np.asarray(flag),
     )
 
 
@@ -333,12 +343,31 @@ def _differences(
     return central_differences(ends, _STEPS, lambda step: same[step])
 
 
+def _horizons(given: Sequence[float] | None, duration: float, dt: float) -> Numbers:
+    steps = round(duration / dt)
+    if given is None:
+        return dt * np.unique(np.maximum(1, np.round(steps * np.arange(1, 5) / 4.0)))
+    try:
+        ends = np.asarray(given, dtype=np.float64)
+        counts = np.round(ends / dt)
+        fits = ends.ndim == 1 and ends.size > 0 and np.all(np.abs(ends / dt - counts) <= 1e-6 * counts)
+        if fits and counts[0] >= 1 and counts[-1] <= steps and np.all(np.diff(counts) > 0):
+            return ends
+    except (TypeError, ValueError):
+        pass
+    allowed = f"rising times above 0 s, at most the duration, {duration:g} s, each a whole number of steps of {dt:g} s"
+    raise InputError("horizons", given, allowed)
+
+
 def _vector(parameters: Mapping[str, Any], n: int, each: bool) -> tuple[tuple[str, ...], Numbers, Any]:
     """Names of the elements, values (n, d), and what makes the mapping again."""
     names: list[str] = []
     columns, shapes = [], []
     for name, value in parameters.items():
-        array = np.asarray(value, dtype=np.float64)
+        try:
+            array = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError) as problem:
+            raise InputError(f"parameters[{name}]", value, "a finite number or vector") from problem
         array = array if each else np.broadcast_to(array, (n, *array.shape))
         if array.ndim not in (1, 2) or array.shape[0] != n or not np.all(np.isfinite(array)):
             raise InputError(f"parameters[{name}]", value, "a finite number or vector" + (", for each start" * each))
@@ -365,7 +394,7 @@ def _scales(names: tuple[str, ...], x: Numbers, given: Mapping[str, float]) -> N
     for name, value in given.items():
         if name not in known:
             raise InputError(f"scales[{name}]", value, "the name of a parameter: " + ", ".join(sorted(known)))
-        if not (math.isfinite(value) and value > 0):
+        if isinstance(value, (bool, str)) or not (math.isfinite(value) and value > 0):
             raise InputError(f"scales[{name}]", value, "a finite number above 0")
         chosen = [i for i, one in enumerate(names) if name in (one, one.split("[")[0])]
         scale[:, chosen] = value
@@ -413,6 +442,8 @@ def parametrise(
     parameters |= {name: float(getattr(law, name)) for name in of_law}
     parameters |= {name: float(getattr(gate, name)) for name in of_gate}
     A, B = linearize(plant)
+    if (Q is None) != (R is None):
+        raise InputError("R" if R is None else "Q", None, "given: a design has both weights")
     if Q is not None:
         parameters |= {"Q": np.asarray(Q, dtype=np.float64), "R": float(R)}
     elif poles is not None:

@@ -54,6 +54,16 @@ def test_arguments_that_mean_nothing_are_refused_by_name(arguments, field):
     assert caught.value.field == field
 
 
+@pytest.mark.parametrize("direction", ["forward", "reverse"])
+def test_an_objective_that_is_no_number_and_parameters_that_are_no_floats_are_refused(direction):
+    with pytest.raises(InputError) as caught:
+        gradients(lambda p, start: p["cart"], parameters(), STARTS, direction=direction)
+    assert caught.value.field == "objective"
+    with pytest.raises(InputError) as caught:
+        gradients(outside, parameters() | {"energy_gain": 5}, STARTS, direction=direction)
+    assert caught.value.field == "parameters['energy_gain']"
+
+
 @pytest.mark.parametrize("n", [1, 2, 10, 16, 23])
 def test_a_scan_in_segments_is_a_scan(n):
     def body(carry, x):
@@ -80,4 +90,4 @@ def test_segments_keep_less():
         jax.jit(jax.grad(cost), static_argnums=2).lower(5.0, start, c).compile().memory_analysis().temp_size_in_bytes
         for c in ("every_step", "segments")
     ]
-    assert memory[1] < 0.2 * memory[0]
+    assert memory[1] < 0.3 * memory[0]

@@ -179,8 +179,57 @@ def test_a_runaway_is_held_and_flagged_as_on_the_other_path():
     fall = replace(loop(), regulator=StateFeedback([-1e6, -1e6, -1e6, -1e6]))
     plant = replace(PLANT, motor=replace(PLANT.motor, voltage_limit=1e9))
     run = located(plant, fall, State(0.0, 0.1, 0.1, 0.0), duration=0.4)
-    assert int(run.flag) & (Flag.RUNAWAY | Flag.OVERFLOW)
+    assert int(run.flag) & Flag.RUNAWAY
     assert np.all(np.isfinite(run.state.vector()))
+
+
+@pytree
+class Elapsed:
+    """The shortest time between samples, and what was located."""
+
+    def init(self, sample):
+        return jnp.full_like(sample.time, jnp.inf), 0 * sample.crossing
+
+    def update(self, memory, sample):
+        shortest, crossings = memory
+        apart = jnp.where(sample.time > 0.0, sample.elapsed, jnp.inf)
+        return jnp.minimum(shortest, apart), crossings + (sample.crossing > 0).astype(jnp.int32)
+
+    def finish(self, memory, last):
+        return (*memory, last.flag)
+
+
+def test_with_coarse_steps_time_never_runs_backwards_and_the_supply_is_never_exceeded():
+    draws = random_draws(1500, 3, jnp.float64)
+
+    def seen(x):
+        plant, controller, start = random_loop(x)
+        settings = {"duration": 0.4, "dt": 1e-2, "switching": "located", "spare_steps": 400}
+        shortest, _, flag = cpjax.measure(plant, controller, start, metrics=Elapsed(), **settings)
+        peak = cpjax.measure(plant, controller, start, **settings).peak_voltage
+        return shortest, flag, peak / plant.motor.voltage_limit
+
+    shortest, flag, peak = jax.jit(jax.vmap(seen))(draws)
+    clean = flag == 0
+    assert np.mean(clean) > 0.8
+    assert np.min(shortest[clean]) >= -1e-6 * 1e-2
+    assert np.max(peak) <= 1.0 + 1e-6
+
+
+def test_a_demand_that_jumps_from_one_limit_past_the_other_never_exceeds_the_supply():
+    run = located(PLANT, StateFeedback(SOFT.regulator.K), State(0.0, 0.0, 3.0, 2.0), duration=1.0)
+    assert np.max(np.abs(run.voltage)) <= 12.0
+    assert 0.0 <= run.metrics.effort <= 144.0 * (1 + 1e-9)
+
+
+def test_a_run_that_is_held_just_after_a_crossing_counts_it_once():
+    inside = State(0.0, 0.0, 0.6, -3.0)
+    plant = replace(PLANT, motor=replace(PLANT.motor, voltage_limit=1e4))
+    for spare in range(CROSSING_COST + 1):
+        settings = {"duration": 0.1, "dt": 2e-3, "switching": "located", "spare_steps": spare}
+        _, crossings, flag = cpjax.measure(plant, loop(plant=plant), inside, metrics=Elapsed(), **settings)
+        assert crossings <= 1
+        assert (flag == 0) == (spare == CROSSING_COST)
 
 
 @pytest.mark.parametrize(
@@ -279,7 +328,7 @@ def test_read_per_step_the_gate_has_no_derivative_and_the_others_are_off(derivat
     plain = jax.jit(jax.grad(lambda x: cost(x, switching="per_step")))(x[0])
     assert plain[2] == plain[3] == 0.0
     assert np.all(np.abs(reverse[0, 2:4]) > 1e-3)
-    assert np.all(np.abs(plain / reverse[0] - 1.0)[[0, 1, 6, 7]] > 1e-4)
+    assert np.max(np.abs(plain / reverse[0] - 1.0)[[0, 1, 6, 7]]) > 1e-2
 
 
 def test_float32_gives_the_derivatives_to_three_digits(derivatives):
@@ -351,14 +400,18 @@ def random_draws(count, seed, dtype):
     return jnp.asarray(np.concatenate([parameters, states], axis=1), dtype=dtype)
 
 
-def outcome(x):
+def random_loop(x):
     energy_gain, damping, half_angle, rate, *rest = x[:10]
     K, limit, length = jnp.stack(rest[:4])[None], rest[4], rest[5]
     plant = CartPole(pole_length=length, motor=Motor(voltage_limit=limit))
     law = EnergySwingUp(plant, energy_gain=energy_gain, cart_stiffness=4.0, cart_damping=damping)
     controller = Hybrid(law, StateFeedback(K), AngleRateGate(half_angle, rate))
-    start = State.from_vector(x[10:])
-    return cpjax.measure(plant, controller, start, duration=1.0, dt=2e-3, switching="located", metrics=OutsideAndFlag())
+    return plant, controller, State.from_vector(x[10:])
+
+
+def outcome(x):
+    settings = {"duration": 1.0, "dt": 2e-3, "switching": "located"}
+    return cpjax.measure(*random_loop(x), metrics=OutsideAndFlag(), **settings)
 
 
 def check_random_draws(count, dtype, chunk):

@@ -10,7 +10,7 @@ import pytest
 from jax import lax
 
 from cpjax.sim.integrators import rk4
-from cpjax.sim.switching import CROSSING_COST, Observation, iterate, start_clock
+from cpjax.sim.switching import CROSSING_COST, Observation, iterate, start_motion
 
 DT = 1e-3
 
@@ -50,7 +50,7 @@ def run(system, q, v, mode, steps, dt=DT, spare=64):
         done = clock.passed >= steps
         return jax.tree.map(lambda old, new: jnp.where(done, old, new), clock, after), None
 
-    clock, _ = lax.scan(body, start_clock(system, q, v, mode, dt), None, length=steps + spare)
+    clock, _ = lax.scan(body, start_motion(system, q, v, mode, dt), None, length=steps + spare)
     return clock
 
 
@@ -171,6 +171,54 @@ def test_of_two_crossings_in_one_step_the_earlier_is_first_and_both_happen(first
     if first != second:
         slope = jax.grad(lambda wall: end(wall)[0])(system.first)
         assert float(slope) == pytest.approx((exact(first + 1e-6) - exact(first - 1e-6)) / 2e-6, rel=1e-8)
+
+
+class Twins(NamedTuple):
+    """An oscillator with two guards that are the same."""
+
+    wall: jax.Array
+
+    def observe(self, q, v, mode):
+        gap = self.wall - q
+        return Observation(-9.0 * q - 1.0, (jnp.where(mode % 2 == 0, gap, 1.0), jnp.where(mode < 2, gap, 1.0)), ())
+
+    def jump(self, q, v, mode, guard):
+        return q, v, mode + jnp.where(guard == 0, 1, 2)
+
+
+def test_two_guards_that_fall_at_one_instant_are_both_passed():
+    walls = jnp.linspace(0.2, 0.8, 500)
+    clock = jax.vmap(lambda w: run(Twins(w), 0.0 * w, 4.0 + 0.0 * w, jnp.zeros((), dtype=int), 30, dt=0.02, spare=32))(
+        walls
+    )
+    assert np.all(clock.passed == 30)
+    assert np.all(clock.mode == 3)
+
+
+class Sharp(NamedTuple):
+    """A guard that is nothing like a cubic on the scale of a step."""
+
+    at: jax.Array
+
+    def observe(self, q, v, mode):
+        return Observation(0.0 * q, (jnp.where(mode == 0, jnp.tanh(200.0 * (self.at - q)), 1.0),), ())
+
+    def jump(self, q, v, mode, guard):
+        return q, 0.5 * v, mode + 1
+
+
+def test_a_guard_unlike_a_cubic_is_located_all_the_same_and_time_never_runs_backwards():
+    at = jnp.linspace(0.21, 0.39, 37)
+
+    def end(at):
+        clock = run(Sharp(at), 0.0 * at, 1.0 + 0.0 * at, jnp.zeros((), dtype=int), 8, dt=0.1)
+        return clock.q, (clock.passed, clock.mode)
+
+    (q, (passed, mode)), slope = jax.vmap(jax.value_and_grad(end, has_aux=True))(at)
+    assert np.all(passed == 8)
+    assert np.all(mode == 1)
+    np.testing.assert_allclose(q, at + 0.5 * (0.8 - at), rtol=1e-6)
+    np.testing.assert_allclose(slope, 0.5, rtol=1e-6)
 
 
 def test_the_order_of_the_integrator_is_kept_across_events():

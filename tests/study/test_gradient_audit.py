@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -142,6 +143,14 @@ def test_table_picture_sentences_and_document_have_what_was_found(audit):
         ({"scales": {"energy_gain": 0.0}}, "scales[energy_gain]"),
         ({"horizons": []}, "horizons"),
         ({"horizons": [1.0, 9.0]}, "horizons"),
+        ({"horizons": [1.2, 0.8]}, "horizons"),
+        ({"horizons": [0.0013]}, "horizons"),
+        ({"horizons": ["a"]}, "horizons"),
+        ({"temperatures": (0.0,)}, "temperatures"),
+        ({"temperatures": ("a",)}, "temperatures"),
+        ({"parameters": PARAMETERS | {"energy_gain": "x"}}, "parameters[energy_gain]"),
+        ({"scales": {"half_angle": "x"}}, "scales[half_angle]"),
+        ({"starts": State(*(jnp.float32(column) for column in (0.0, 0.0, 3.0, 0.0)))}, "starts"),
         ({"duration": 1.0, "dt": 0.3}, "duration"),
         ({"starts": 3}, "starts"),
         ({"build": lambda p: (PLANT, StateFeedback(K))}, "build"),
@@ -169,6 +178,18 @@ def test_a_loops_numbers_by_name_make_the_loop_again():
         assert set(chosen.scales) == {"cart_friction", "pivot_friction", "hysteresis"}
     with pytest.raises(InputError):
         parametrise(PLANT, controller.swing_up)
+    with pytest.raises(InputError, match="both weights"):
+        parametrise(PLANT, controller, Q=paper.Q)
+
+
+@pytest.mark.slow
+def test_a_supply_without_limit_is_audited_too():
+    plant = replace(PLANT, motor=replace(PLANT.motor, voltage_limit=math.inf))
+    chosen = parametrise(plant, paper.controller("corrected-centred", "placement", plant))
+    assert "voltage_limit" not in chosen.parameters
+    found = audit_gradients(chosen.build, chosen.parameters, STARTS, scales=chosen.scales, **SHORT, temperatures=(0.1,))
+    assert np.all(np.isfinite(found.smooth[0]))
+    assert np.nanmax(np.where(found.resolved, found.errors(found.located), np.nan)[:, -1]) <= 1e-6
 
 
 @pytest.fixture
