@@ -73,17 +73,8 @@ def _named(report: Report, name: str) -> Report:
     return lambda done, total, text: report(done, total, f"{name}: {text}")
 
 
-def _compared(audit: GradientAudit) -> np.ndarray[Any, Any]:
-    """Which derivatives are compared (n, d): of runs that the rule keeps, where the difference decides."""
-    return audit.trusted[:, None] & audit.resolved[:, -1]
-
-
-def _undecided(audit: GradientAudit) -> int:
-    return int(np.sum(audit.trusted[:, None] & ~audit.resolved[:, -1]))
-
-
 def _summary(audit: GradientAudit) -> dict[str, Any]:
-    compared = _compared(audit)
+    compared = audit.compared[:, -1]
     parameters = {}
     for i, name in enumerate(audit.names):
         chosen = compared[:, i]
@@ -100,7 +91,7 @@ def _summary(audit: GradientAudit) -> dict[str, Any]:
     return {
         "runs": len(verdicts),
         "left_out": {kind: verdicts.count(kind) for kind in ("grazing", "chaotic")},
-        "undecided": _undecided(audit),
+        "undecided": audit.undecided,
         "crossings": np.bincount(np.minimum(audit.crossings[audit.trusted, -1], 3), minlength=4),
         "slowest_crossing": audit.speed[:, -1],
         "growth": audit.growth[:, -1],
@@ -112,15 +103,15 @@ def _total(audits: dict[str, GradientAudit]) -> dict[str, Any]:
     found: dict[str, Any] = {
         "runs": sum(len(a.flag) for a in audits.values()),
         "left_out": sum(int(np.sum(~a.trusted)) for a in audits.values()),
-        "undecided": sum(_undecided(a) for a in audits.values()),
-        "compared": sum(int(_compared(a).sum()) for a in audits.values()),
+        "undecided": sum(a.undecided for a in audits.values()),
+        "compared": sum(int(a.compared[:, -1].sum()) for a in audits.values()),
     }
     for m, (method, _) in enumerate(methods(next(iter(audits.values())))):
         errors, wrong = [], 0
         for audit in audits.values():
             gradient = methods(audit)[m][1]
-            errors.append(audit.errors(gradient)[:, -1][_compared(audit)])
-            wrong += int(np.sum(audit.wrong_signs(gradient)[:, -1][_compared(audit)]))
+            errors.append(audit.errors(gradient)[:, -1][audit.compared[:, -1]])
+            wrong += int(np.sum(audit.wrong_signs(gradient)[:, -1][audit.compared[:, -1]]))
         every = np.concatenate(errors)
         found[method] = {
             "median": float(np.median(every)),

@@ -69,6 +69,10 @@ def test_no_page_has_a_gap_left_to_fill():
         assert re.findall(r"^.*\b[A-Z0-9]+_(?:TABLE|NOTE)\b.*$", page.read_text(), flags=re.MULTILINE) == []
 
 
+def test_no_page_has_a_gap_left_to_fill_in():
+    assert not [page.name for page in PAGES if "@@" in page.read_text()]
+
+
 def test_no_page_has_a_broken_link():
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#]+)", page.read_text()):

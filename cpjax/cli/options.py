@@ -104,6 +104,7 @@ RUN_OPTIONS = [
     Option("run", "dt", "integration step [s] (default 0.002)", float),
     Option("run", "clock", "when the law is evaluated (default sampled)", choices=("sampled", "continuous")),
     Option("run", "control_period", "of the sampled clock [s] (default one step)", float),
+    Option("run", "switching", "located: inside the steps of the continuous clock", choices=("per_step", "located")),
     Option("run", "integrator", "(default rk4)", choices=tuple(INTEGRATORS)),
 ]
 

@@ -32,7 +32,7 @@ def cells(audit: GradientAudit) -> list[list[str]]:
     """
     lines = []
     for i, name in enumerate(audit.names):
-        chosen = audit.trusted & audit.resolved[:, -1, i]
+        chosen = audit.compared[:, -1, i]
         found = [(audit.errors(g)[chosen, -1, i], audit.wrong_signs(g)[chosen, -1, i]) for _, g in methods(audit)]
         texts = [f"{np.median(errors):.1e} ({int(wrong.sum())})" if chosen.any() else "-" for errors, wrong in found]
         lines.append([name, str(int(chosen.sum())), *texts])
@@ -44,7 +44,7 @@ def findings(audit: GradientAudit) -> list[str]:
     kinds = [kind for kind, _ in audit.verdicts]
     counts = ", ".join(f"{kinds.count(k)} {k}" for k in ("trustworthy", "grazing", "chaotic", "stopped"))
     sentences = [f"Of {len(kinds)} starts: {counts}."]
-    chosen = audit.trusted[:, None] & audit.resolved[:, -1]
+    chosen = audit.compared[:, -1]
     if not chosen.any():
         return [*sentences, "No start is left for a comparison."]
     for name, gradient in methods(audit):
@@ -53,9 +53,10 @@ def findings(audit: GradientAudit) -> list[str]:
             f"{name.capitalize()}: relative errors of {np.median(errors):.1e} in the median and {np.max(errors):.1e} "
             f"at worst, {int(wrong.sum())} of {errors.size} derivatives with the wrong sign."
         )
-    undecided = int(np.sum(audit.trusted[:, None] & ~audit.resolved[:, -1]))
-    if undecided:
-        sentences.append(f"{undecided} derivatives were not compared: next to a kink no difference is certain enough.")
+    if audit.undecided:
+        sentences.append(
+            f"{audit.undecided} derivatives were not compared: next to a kink no difference is certain enough."
+        )
     return sentences
 
 

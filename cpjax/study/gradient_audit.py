@@ -123,6 +123,17 @@ class GradientAudit:
         return np.array([kind == "trustworthy" for kind, _ in self.verdicts])
 
     @property
+    def compared(self) -> Numbers:
+        """Which derivatives a comparison is about: of trustworthy starts, where the difference decides (n, k, d)."""
+        compared: Numbers = self.trusted[:, None, None] & self.resolved
+        return compared
+
+    @property
+    def undecided(self) -> int:
+        """How many derivatives of trustworthy starts no difference decides, at the last horizon."""
+        return int(np.sum(self.trusted[:, None] & ~self.resolved[:, -1]))
+
+    @property
     def verdicts(self) -> list[tuple[str, str]]:
         """For each start: trustworthy, grazing, chaotic or stopped; and why. Over all horizons."""
         found = []
