@@ -45,7 +45,7 @@ def objective(switching: Any, checkpoint: Any, duration: float) -> Callable[[Map
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     """Prints the table and writes gradient_cost.json."""
-    duration, repeats, many = (0.1, 1, 64) if quick else (DURATION, 7, 4096)
+    duration, repeats, many = (0.1, 1, 64) if quick else (DURATION, 5, 4096)
     parameters = {
         "energy_gain": jnp.asarray(5.0),
         "cart_stiffness": jnp.asarray(4.0),

@@ -30,7 +30,7 @@ from cpjax import (
     paper,
     rollout,
 )
-from cpjax.controllers import SingleLaw
+from cpjax.controllers import SingleLaw, SmoothClip, SmoothHybrid
 from cpjax.sim.rollout import Trajectory
 
 AWKWARD = (0.1 + 0.2, 1 / 3, -0.0, 5e-324)  # no short decimals; a signed zero; the smallest float
@@ -70,6 +70,8 @@ THINGS = {
     "LyapunovGate": LyapunovGate(WEIGHT, level=1 / 3),
     "Hybrid": Hybrid(EnergySwingUp(PLANT, energy_gain=5.0), LAW, LyapunovGate(WEIGHT, level=1 / 3)),
     "SingleLaw": SingleLaw(LAW),
+    "SmoothHybrid": SmoothHybrid(LAW, StateFeedback([1.0, 2.0, 3.0, 4.0]), AngleGate(0.3), temperature=0.02),
+    "SmoothClip": SmoothClip(LAW, voltage_limit=9.0, temperature=0.5),
     "ProtocolMetrics": ProtocolMetrics(hold=1 / 3),
     "Metrics": METRICS,
     "Metrics of a sweep": jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), METRICS),

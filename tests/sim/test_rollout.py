@@ -93,6 +93,8 @@ def test_the_settling_metrics_know_late_early_and_lost_bands():
                 mode=jnp.asarray(1),
                 cart_acceleration=zero,
                 flag=jnp.asarray(0),
+                crossing=jnp.asarray(0),
+                crossing_speed=zero,
             )
             for i, v in enumerate(x)
         ]
