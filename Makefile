@@ -11,7 +11,7 @@ report: .venv/ready  ## the main job: the paper's controllers, reproduced, as on
 	$(BIN)/cpjax report --out $(OUT)/report
 
 test: check  ## linter, type checker, tests with warnings as errors
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 test-slow: .venv/ready-test  ## the tests that take minutes
 	$(BIN)/python -m pytest -n 2 -m slow

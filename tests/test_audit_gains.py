@@ -76,6 +76,7 @@ def as_plain(value):
 # --- audit-gains ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_audit_of_the_paper_writes_json_and_a_picture_and_says_what_it_found(command, tmp_path):
     result = command("audit-gains", "--out", tmp_path, *PAIR)
     assert result.code == 0

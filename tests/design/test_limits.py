@@ -305,6 +305,7 @@ def test_derivatives_agree_forward_in_reverse_with_differences_and_under_vmap(na
 slopes = jax.jit(jax.grad(level_within_angle_and_rate, argnums=(0, 1, 2)))
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_the_level_inside_angle_and_rate_are_those_of_the_first():
     def gradient(limits):
         return jnp.stack(slopes(FORM, limits[0], limits[1])[1:])

@@ -356,6 +356,7 @@ def test_the_papers_gain_has_the_derivatives_that_differences_have_and_vmap_chan
         assert relative_error(single(jnp.asarray(point)), reverse[i]) <= 1e-13
 
 
+@pytest.mark.slow
 def test_the_second_derivatives_are_the_differences_of_the_first():
     x = points(3)[2]
 

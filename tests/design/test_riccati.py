@@ -221,7 +221,7 @@ def test_a_mode_that_rounding_hides_is_refused_or_the_rounded_problem_is_solved(
     # Rounding may give a mode a weight, and may move one on the edge inside; it never gives a mode an input.
     wrong = []
     for name, (slow, Q, B) in HIDDEN.items():
-        problems = list(rotated(time, 400, slow[time], Q, B, seed=7))
+        problems = list(rotated(time, 120, slow[time], Q, B, seed=7))
         P, K, found = solved_in_batches(time, problems)
         assert np.all(np.isnan(P[~found]))
         answers = [(*problems[i][:2], K[i]) for i in np.flatnonzero(found)]
@@ -396,7 +396,7 @@ def steps(time, problem):
     [
         ("continuous", 4, 1),
         pytest.param("continuous", 5, 2, marks=pytest.mark.slow),
-        ("discrete", 3, 2),
+        pytest.param("discrete", 3, 2, marks=pytest.mark.slow),
         pytest.param("discrete", 4, 1, marks=pytest.mark.slow),
     ],
 )
@@ -483,7 +483,8 @@ def check_ill_conditioned_derivatives(time):
     assert max(conditions) > 1e7
 
 
-@pytest.mark.parametrize("time", ["continuous", pytest.param("discrete", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@both
 def test_second_derivatives_are_the_differences_of_the_first_and_no_lane_of_a_batch_of_gradients_spoils_another(time):
     problem = random_problem(2, 1, np.random.default_rng(11))
     x = vector(problem)
