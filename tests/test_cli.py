@@ -178,6 +178,7 @@ CASES = [
     {"run.dt": 0.02},
     {"run.clock": "continuous"},
     {"run.control_period": 0.05},
+    {"run.clock": "continuous", "run.switching": "located"},
     {"run.integrator": "semi-implicit-euler"},
     {"plant.base": "identified"},
     *({f"plant.{name}": 2.5} for name in ("cart_mass", "pole_mass", "pole_length", "gravity", "pole_inertia")),
