@@ -58,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     import jax
 
     # The protocol's figures are float64. Set here, in the application: the library never touches JAX's settings.
-    jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # untyped in JAX
+    jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # JAX has no annotations for it
     try:
         code: int = options.run(options)
         return code

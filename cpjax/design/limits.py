@@ -97,9 +97,10 @@ def level_within_angle_and_rate(P: MatrixLike, half_angle: Scalar, rate: Scalar)
 def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -> jax.Array:
     """The level at which the level set's shadow (2, 2) on angle and rate touches the gate's boundary."""
     gate = jnp.linalg.inv(shadow), half_angle, rate
-    fixed = lax.stop_gradient(gate)
+    fixed = lax.stop_gradient(gate)  # where the level touches is searched for without derivatives, then tied to it
     # Positions are angles in the plane in which the shadow is about as wide as it is high: however far apart angle and
-    # rate are in size, the level changes over no small part of a turn.
+    # rate are in size, the level changes over no small part of a turn. The choice of plane is no part of the level, so it
+    # has no derivative.
     ratio = lax.stop_gradient(half_angle * jnp.sqrt(shadow[1, 1]) / (rate * jnp.sqrt(shadow[0, 0])))
 
     def level(position: jax.Array, form: jax.Array, half_angle: jax.Array, rate: jax.Array) -> jax.Array:
@@ -160,7 +161,7 @@ def _positive_definite(name: str, P: jax.Array, size: int | None = None) -> jax.
     n = square(name, P)
     shaped(name, P, (size or n,) * 2)
     P = 0.5 * (P + P.T)
-    definite = _is_positive_definite(lax.stop_gradient(P))
+    definite = _is_positive_definite(lax.stop_gradient(P))  # a yes or no, which has no derivative
     if not is_traced(definite) and not definite:
         raise InputError(name, P, "positive definite, by a margin that rounding leaves visible")
     return jnp.where(definite, P, jnp.nan)

@@ -154,7 +154,7 @@ def margins(A: Any, B: Any, K: Any) -> Margins:
 @jax.jit
 def _margins(A: jax.Array, B: jax.Array, K: jax.Array) -> Margins:
     closed = A - jnp.outer(B, K)
-    poles = jnp.linalg.eigvals(lax.stop_gradient(closed))
+    poles = jnp.linalg.eigvals(lax.stop_gradient(closed))  # for the scale and yes or no only; NaN where two meet
     stable = jnp.all(poles.real < 0.0)
     # A harmless stand-in keeps numbers and derivatives finite where the answer will be NaN.
     closed = jnp.where(stable, closed, -jnp.eye(A.shape[0], dtype=A.dtype))
@@ -162,7 +162,7 @@ def _margins(A: jax.Array, B: jax.Array, K: jax.Array) -> Margins:
     loop = _Loop(closed, B, K)
     scale = jnp.exp(jnp.mean(jnp.log(jnp.abs(poles))))
 
-    fixed = lax.stop_gradient(loop)
+    fixed = lax.stop_gradient(loop)  # candidates are guesses; `_tied` gives their roots the derivative
     lower, upper = _gain_margins(_crossovers(_imaginary_part, _phase_candidates(fixed, scale), loop, scale), loop)
     crossovers = _crossovers(_above_half, _gain_candidates(fixed), loop, scale)
     phase, delay = _phase_and_delay_margins(crossovers, loop)
@@ -306,7 +306,7 @@ def _root(condition: _OfFrequency, guess: jax.Array, loop: _Loop, scale: jax.Arr
 
     Where there is none they do not: at a distance d from the axis they stay longer than d.
     """
-    fixed = lax.stop_gradient(loop)
+    fixed = lax.stop_gradient(loop)  # the iteration is not differentiated; `_tied` does what the equation says
 
     def newton(_: Any, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         frequency, _ = carry
@@ -382,7 +382,7 @@ def _peak(loop: _Loop, scale: jax.Array, frequencies: jax.Array) -> _Margin:
     Level by level after Bruinsma and Steinbuch (1990): the axis candidates of a level bound the intervals that rise
     above it, and the highest of these intervals' middles is the next level. No peak is too narrow for it.
     """
-    fixed = lax.stop_gradient(loop)
+    fixed = lax.stop_gradient(loop)  # the search is not differentiated; at a maximum only the value's own part counts
     tolerance = math.sqrt(_epsilon(scale))
 
     def higher(ascent: _Ascent, frequencies: jax.Array) -> _Ascent:
@@ -403,12 +403,13 @@ def _peak(loop: _Loop, scale: jax.Array, frequencies: jax.Array) -> _Margin:
 
     rounds = jnp.zeros((), dtype=jnp.int32)
     flat = _Ascent(jnp.full_like(scale, tolerance), jnp.full_like(scale, jnp.inf), rounds == 0, rounds)
+    # Where the search begins has no part in where it ends.
     ascent = higher(flat, lax.stop_gradient(jnp.pad(frequencies, (1, 0))))._replace(rising=rounds == 0)
     ascent = lax.while_loop(lambda ascent: ascent.rising & (ascent.rounds < 30), rise, ascent)
 
     bounded = jnp.isfinite(ascent.frequency)
     polished, valid = _root(_excess_slope, jnp.where(bounded, ascent.frequency, 0.0), loop, scale)
-    # Newton's method may have gone to another stationary point.
+    # Newton's method may have gone to another stationary point: a yes or no, which has no derivative.
     same = valid & (_excess(lax.stop_gradient(polished), fixed) > 0.999 * ascent.level)
     frequency = jnp.where(same, polished, ascent.frequency)
     return jnp.where(bounded, _excess(jnp.where(bounded, frequency, scale), loop), 0.0), frequency

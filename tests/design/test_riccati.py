@@ -221,7 +221,7 @@ def test_a_mode_that_rounding_hides_is_refused_or_the_rounded_problem_is_solved(
     # Rounding may give a mode a weight, and may move one on the edge inside; it never gives a mode an input.
     wrong = []
     for name, (slow, Q, B) in HIDDEN.items():
-        problems = list(rotated(time, 120, slow[time], Q, B, seed=7))
+        problems = list(rotated(time, 400, slow[time], Q, B, seed=7))
         P, K, found = solved_in_batches(time, problems)
         assert np.all(np.isnan(P[~found]))
         answers = [(*problems[i][:2], K[i]) for i in np.flatnonzero(found)]
