@@ -99,7 +99,7 @@ def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -
     gate = jnp.linalg.inv(shadow), half_angle, rate
     fixed = lax.stop_gradient(gate)  # where the level touches is searched for without derivatives, then tied to it
     # Positions are angles in the plane in which the shadow is about as wide as it is high: however far apart angle and
-    # rate are in size, the level changes over no small part of a turn. The choice of plane is no part of the level, so it
+    # rate are in size, the level changes over no small part of a turn. The level does not depend on that choice, so it
     # has no derivative.
     ratio = lax.stop_gradient(half_angle * jnp.sqrt(shadow[1, 1]) / (rate * jnp.sqrt(shadow[0, 0])))
 
