@@ -97,7 +97,7 @@ def level_within_angle_and_rate(P: MatrixLike, half_angle: Scalar, rate: Scalar)
 def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -> jax.Array:
     """The level at which the level set's shadow (2, 2) on angle and rate touches the gate's boundary."""
     gate = jnp.linalg.inv(shadow), half_angle, rate
-    fixed = lax.stop_gradient(gate)  # where the level touches is searched for without derivatives, then tied to it
+    fixed = lax.stop_gradient(gate)  # the search is not differentiated; the last lines say where the derivative is from
     # Positions are angles in the plane in which the shadow is about as wide as it is high: however far apart angle and
     # rate are in size, the level changes over no small part of a turn. The level does not depend on that choice, so it
     # has no derivative.
