@@ -27,7 +27,9 @@ from cpjax.controllers import (
     AngleRateGate,
     EnergySwingUp,
     Hybrid,
+    LqrWeights,
     LyapunovGate,
+    PoleFactors,
     SingleLaw,
     SmoothClip,
     SmoothHybrid,
@@ -51,6 +53,8 @@ TYPES: dict[str, type] = {
         State,
         Motor,
         CartPole,
+        LqrWeights,
+        PoleFactors,
         StateFeedback,
         EnergySwingUp,
         paper.PrintedSwingUp,
@@ -103,7 +107,8 @@ def encode(thing: Any) -> dict[str, Any]:
     if TYPES.get(name) is not type(thing):
         raise InputError("thing", thing, "one of " + ", ".join(TYPES))
     fields = {f.name: getattr(thing, f.name) for f in dataclasses.fields(TYPES[name])}
-    return {"type": name, **{key: _encode_value(f"{name}.{key}", value) for key, value in fields.items()}}
+    given = {key: value for key, value in fields.items() if value is not None}
+    return {"type": name, **{key: _encode_value(f"{name}.{key}", value) for key, value in given.items()}}
 
 
 def read_table(path: Path) -> dict[str, Any]:

@@ -206,6 +206,9 @@ def _check_fields(name: str, tree: Any) -> None:
         path, value, rule = f"{name}.{field.name}", getattr(tree, field.name), declared.get(field.name)
         if dataclasses.is_dataclass(value):
             _check_fields(path, value)
+        elif isinstance(value, tuple):  # of components
+            for i, one in enumerate(value):
+                check(f"{path}[{i}]", one)
         elif rule is not None or not declared:  # a State declares nothing and holds scalars
             expected = rule.shape if isinstance(rule, Matrix) else ()
             if np.shape(value) != expected:

@@ -23,6 +23,7 @@ ROOMS = [
     "sim",
     "io",
     "bridges",
+    "tune",
     "study",
     "show",
     "cli",

@@ -1,7 +1,7 @@
 """What runs in the loop: laws, gates, and the hybrid controller that holds them."""
 
 from cpjax.controllers.energy import EnergySwingUp
-from cpjax.controllers.feedback import StateFeedback
+from cpjax.controllers.feedback import Design, LqrWeights, PoleFactors, StateFeedback
 from cpjax.controllers.gates import AngleGate, AngleRateGate, Gate, LyapunovGate
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import REGULATE, SWING_UP, Controller, Law, SingleLaw, SmoothController, as_controller
@@ -13,11 +13,14 @@ __all__ = [
     "AngleGate",
     "AngleRateGate",
     "Controller",
+    "Design",
     "EnergySwingUp",
     "Gate",
     "Hybrid",
     "Law",
+    "LqrWeights",
     "LyapunovGate",
+    "PoleFactors",
     "SingleLaw",
     "SmoothClip",
     "SmoothController",

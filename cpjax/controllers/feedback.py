@@ -1,21 +1,94 @@
-"""Linear state feedback."""
+"""Linear state feedback, and the two designs that it comes from."""
 
-from cpjax.pytree import Array, Scalar, matrix, part, pytree
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cpjax.design.lqr import lqr
+from cpjax.design.lyapunov import lyapunov
+from cpjax.design.placement import QuadraticFactors, place_polynomial
+from cpjax.errors import InputError
+from cpjax.pytree import Array, Scalar, is_traced, matrix, number, part, pytree
 from cpjax.state import NAMES, UPRIGHT, State, checked_reference, deviation
+
+
+class Designed(NamedTuple):
+    """What a design makes of a linear model."""
+
+    K: jax.Array
+    """Gain (1, 4) of u = -K s."""
+    P: jax.Array
+    """(4, 4): s' P s falls along the linear closed loop."""
+
+
+@runtime_checkable
+class Design(Protocol):
+    """What a gain is designed from."""
+
+    def solve(self, A: Array, B: Array) -> Designed:
+        """The gain for this linear model (4, 4), (4, 1). Differentiable."""
+        ...
+
+
+@pytree
+class LqrWeights:
+    """The weights of a linear quadratic regulator."""
+
+    Q: Array = matrix((4, 4), "per product of states", "state weight, positive semidefinite", symmetric=True)
+    R: Scalar = number("1/V^2", "weight of the voltage", above=0.0)
+
+    def solve(self, A: Array, B: Array) -> Designed:
+        """By the algebraic Riccati equation; P is its solution."""
+        return Designed(*lqr(A, B, self.Q, jnp.reshape(jnp.asarray(self.R), (1, 1))))
+
+
+@pytree
+class PoleFactors:
+    """The poles of a placement, as factors s^2 + a s + b of the characteristic polynomial; see `QuadraticFactors`."""
+
+    a: Array = matrix((2,), "1/s", "above 0: twice the mean rate of decay of each pair")
+    b: Array = matrix((2,), "1/s^2", "above 0: product of each pair")
+
+    def __post_init__(self) -> None:
+        for name in ("a", "b"):
+            value = getattr(self, name)
+            if not is_traced(value) and not np.all(np.asarray(value) > 0.0):
+                raise InputError(f"PoleFactors.{name}", value, "two numbers above 0: the poles are to be stable")
+
+    @property
+    def poles(self) -> jax.Array:
+        """The four of them, to read (4,), complex [1/s]."""
+        return self._factors().poles()
+
+    def solve(self, A: Array, B: Array) -> Designed:
+        """By Ackermann's formula; P solves the closed loop's Lyapunov equation with the right side -I."""
+        K = place_polynomial(A, B, self._factors().polynomial())
+        A, B = jnp.asarray(A), jnp.asarray(B)
+        return Designed(K, lyapunov(A - B @ K, jnp.eye(4, dtype=K.dtype)))
+
+    def _factors(self) -> QuadraticFactors:
+        a, b = jnp.asarray(self.a), jnp.asarray(self.b)
+        return QuadraticFactors(a, b, jnp.zeros((0,), dtype=a.dtype))
 
 
 @pytree
 class StateFeedback:
     """u = -K (s - s_ref), with the angle's error taken modulo a turn. A controller on its own, or Hybrid's regulator.
 
-    A plain sequence of four gains is accepted for K.
+    A plain sequence of four gains is accepted for K. `design` only says where K comes from, so that files and tunings
+    know it; the law is K alone.
     """
 
     K: Array = matrix((1, 4), "V per unit of state", "gain, u = -K (s - s_ref)")
     reference: State = part("the state to hold, a State", *NAMES, default=UPRIGHT)
+    design: Design | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "reference", checked_reference("StateFeedback.reference", self.reference))
+        if self.design is not None and not hasattr(self.design, "solve"):
+            raise InputError("StateFeedback.design", self.design, "LqrWeights, PoleFactors, or None")
 
     def voltage(self, state: State) -> Scalar:
         """Demanded voltage [V]."""

@@ -1,0 +1,1 @@
+"""Tuning of hybrid controllers by gradients through whole swing-ups."""

@@ -1,0 +1,263 @@
+"""The free parameters of a hybrid controller, as numbers that an optimiser may move anywhere.
+
+Positive parameters are moved by their logarithm, those between two ends by a logit, others as they are. A regulator is
+always the one that its design gives for the swing-up law's model of the plant: gradients pass through Riccati's
+equation, or through the placement.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cpjax.controllers import EnergySwingUp, Hybrid, LqrWeights, LyapunovGate, PoleFactors, StateFeedback
+from cpjax.errors import InputError
+from cpjax.plant import CartPole, linearize
+from cpjax.pytree import Number, rules
+
+Vector: TypeAlias = jax.Array
+"""Shape (d,), unconstrained."""
+
+FROZEN = ("R", "hysteresis", "kick", "kick_radius")
+"""Not free unless asked for: K depends on Q / R alone, and the others are small corrections."""
+
+_LEAST = 1e-3
+"""What a parameter that is zero starts at, in its natural unit: a logarithm knows no zero."""
+
+
+class _Slot(NamedTuple):
+    """Where a parameter stands in the vector, and how it is made."""
+
+    name: str
+    part: str
+    """swing_up, design or gate."""
+    kind: str
+    """log, logit, plain, or full: a Cholesky factor."""
+    begin: int
+    size: int
+    low: float
+    high: float
+    """Ends of the range that random restarts are drawn from."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FreeParameters:
+    """Which numbers of `controller` are free; makes controllers of vectors and vectors of controllers.
+
+    Make it with `free_parameters`.
+    """
+
+    controller: Hybrid
+    slots: tuple[_Slot, ...]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A name for each element of a physical vector, such as "Q[0]"."""
+        return tuple(
+            slot.name if slot.size == 1 else f"{slot.name}[{i}]" for slot in self.slots for i in range(slot.size)
+        )
+
+    def start(self) -> Vector:
+        """The vector of `controller` itself (d,); zeros become small numbers where a logarithm is taken."""
+        parts = []
+        for slot in self.slots:
+            value = np.asarray(_read(self.controller, slot), dtype=np.float64).reshape(-1)
+            if slot.kind == "full":
+                value = _from_full(np.asarray(_weights(self.controller).Q, dtype=np.float64))
+            elif slot.kind == "log":
+                value = np.log(np.maximum(value, _LEAST * slot.high))
+            elif slot.kind == "logit":
+                share = np.clip(value / self._top(slot.name), 1e-6, 1.0 - 1e-6)
+                value = np.log(share) - np.log1p(-share)
+            parts.append(value)
+        return jnp.asarray(np.concatenate(parts), dtype=jnp.result_type(float))
+
+    def physical(self, vector: Vector) -> Vector:
+        """The parameters themselves, in SI units (d,); of a full Q the rows of its lower triangle."""
+        values = (self._value(slot, vector) for slot in self.slots)
+        return jnp.concatenate([v if v.ndim == 1 else v[jnp.tril_indices(4)] for v in values])
+
+    def build(self, vector: Vector) -> Hybrid:
+        """The controller of a vector. Differentiable, under jit and vmap too."""
+        given: dict[str, dict[str, Any]] = {"swing_up": {}, "design": {}, "gate": {}}
+        for slot in self.slots:
+            value = self._value(slot, vector)
+            if slot.name == "Q" and slot.kind == "log":
+                value = jnp.diag(value)
+            given[slot.part][slot.name] = value if slot.name in ("Q", "a", "b") else value[0]
+        regulator: Any = self.controller.regulator
+        swing_up: Any = dataclasses.replace(self.controller.swing_up, **given["swing_up"])  # type: ignore[type-var]
+        gate: Any = dataclasses.replace(self.controller.gate, **given["gate"])  # type: ignore[type-var]
+        if given["design"]:
+            design = dataclasses.replace(regulator.design, **given["design"])
+            found = design.solve(*linearize(swing_up.model))
+            regulator = StateFeedback(found.K, regulator.reference, design)
+            if isinstance(gate, LyapunovGate):
+                gate = dataclasses.replace(gate, P=found.P)
+        return Hybrid(swing_up, regulator, gate)
+
+    def draw(self, random: np.random.Generator, count: int) -> np.ndarray[Any, Any]:
+        """`count` vectors (count, d) from the ranges of random restarts, uniform in logarithm or, an angle, as is."""
+        columns = []
+        for slot in self.slots:
+            low, high = slot.low, slot.high
+            for i in range(slot.size):
+                if slot.kind == "logit":
+                    share = random.uniform(low, high, count) / self._top(slot.name)
+                    columns.append(np.log(share) - np.log1p(-share))
+                elif slot.kind == "full" and i >= 4:
+                    columns.append(random.uniform(-0.5, 0.5, count))
+                elif slot.name == "Q":
+                    scale = _natural(self.controller).weights[i] * float(_weights(self.controller).R)
+                    drawn = math.log(scale) + random.uniform(math.log(low), math.log(high), count)
+                    columns.append(0.5 * drawn if slot.kind == "full" else drawn)
+                elif slot.kind == "log":
+                    columns.append(random.uniform(math.log(low), math.log(high), count))
+                else:
+                    columns.append(random.uniform(low, high, count))
+        return np.stack(columns, axis=1)
+
+    def _value(self, slot: _Slot, vector: Vector) -> jax.Array:
+        x = vector[slot.begin : slot.begin + slot.size]
+        if slot.kind == "log":
+            return jnp.exp(x)
+        if slot.kind == "logit":
+            return self._top(slot.name) * jax.nn.sigmoid(x)
+        return _full(x) if slot.kind == "full" else x
+
+    def _top(self, name: str) -> float:
+        """The upper end of a parameter between zero and something."""
+        if name == "half_angle":  # the way out must not be wider than a half turn
+            return math.pi / (1.0 + float(self.controller.gate.hysteresis))  # type: ignore[attr-defined]
+        return math.pi / 2
+
+
+def free_parameters(
+    controller: Hybrid, free: Sequence[str] | None = None, *, frozen: Sequence[str] = (), full_q: bool = False
+) -> FreeParameters:
+    """The free parameters of a hybrid controller with an energy law and a regulator that knows its design.
+
+    Args:
+      controller: an `EnergySwingUp`, a `StateFeedback` with its `design`, and any gate.
+      free: names such as "energy_gain", "Q", "a", "half_angle"; by default all but `FROZEN`.
+      frozen: names to take out again.
+      full_q: a full state weight instead of a diagonal one.
+
+    Raises:
+      InputError: another kind of controller, or a name that it does not have.
+    """
+    if not isinstance(controller, Hybrid) or not isinstance(controller.swing_up, EnergySwingUp):
+        raise InputError("controller", controller, "a cpjax.Hybrid with a cpjax.EnergySwingUp")
+    regulator = controller.regulator
+    if not isinstance(regulator, StateFeedback) or not isinstance(regulator.design, (LqrWeights, PoleFactors)):
+        raise InputError("regulator", regulator, "a StateFeedback whose design is LqrWeights or PoleFactors")
+    ranges = _ranges(controller)
+    places = {name: "swing_up" for name, rule in rules(EnergySwingUp).items() if isinstance(rule, Number)}
+    places |= dict.fromkeys(("Q", "R") if isinstance(regulator.design, LqrWeights) else ("a", "b"), "design")
+    places |= {name: "gate" for name, rule in rules(type(controller.gate)).items() if isinstance(rule, Number)}
+    for field, names in (("free", free or ()), ("frozen", frozen)):
+        for name in names:
+            if name not in places:
+                raise InputError(field, name, "one of " + ", ".join(places))
+    chosen = [name for name in places if (name not in FROZEN if free is None else name in free) and name not in frozen]
+    if not chosen:
+        raise InputError("free", free, "at least one name that is not frozen")
+    sizes = {"Q": 10 if full_q else 4, "a": 2, "b": 2}
+    slots, begin = [], 0
+    for name in chosen:
+        kind = "log"
+        if name in ("half_angle", "kick_radius"):
+            kind = "logit"
+        elif name == "kick":
+            kind = "plain"
+        elif name == "Q" and full_q:
+            kind = "full"
+        size = sizes.get(name, 1)
+        slots.append(_Slot(name, places[name], kind, begin, size, *ranges[name]))
+        begin += size
+    return FreeParameters(controller, tuple(slots))
+
+
+class _Natural(NamedTuple):
+    """Units that the plant itself suggests, for ranges that fit any rig."""
+
+    rate: float
+    """sqrt(m g l / J): of the small oscillation about hanging [1/s]."""
+    energy_gain: float
+    """The full acceleration over energy and rate of a pendulum that has to be swung up [m/(J s)]."""
+    weights: tuple[float, float, float, float]
+    """Q / R that make the full voltage of one length, or of one radian."""
+    level: float
+    """What it costs to come back, in the unit of the design's s' P s."""
+
+
+def _natural(controller: Hybrid) -> _Natural:
+    law: Any = controller.swing_up
+    plant: CartPole = law.model
+    weight = float(plant.pole_mass) * float(plant.gravity) * float(plant.pole_length)
+    rate = math.sqrt(weight / float(plant.pivot_inertia))
+    limit = float(plant.motor.voltage_limit)
+    voltage = limit if math.isfinite(limit) else 12.0
+    push = abs(float(plant.motor.force_per_voltage)) * voltage / float(plant.moving_mass)
+    length = float(plant.pole_length)
+    per = (voltage / length, voltage / (length * rate), voltage, voltage / rate)
+    design = controller.regulator.design  # type: ignore[attr-defined]
+    level = float(design.R) * voltage * voltage / rate if isinstance(design, LqrWeights) else 1.0 / rate
+    return _Natural(rate, push / (4.0 * weight * rate), tuple(v * v for v in per), level)  # type: ignore[arg-type]
+
+
+def _ranges(controller: Hybrid) -> Mapping[str, tuple[float, float]]:
+    """Of random restarts, in SI units; of Q in natural units."""
+    natural = _natural(controller)
+    w = natural.rate
+    return {
+        "energy_gain": (2.5 * natural.energy_gain, 40.0 * natural.energy_gain),
+        "cart_stiffness": (0.07 * w * w, 1.1 * w * w),
+        "cart_damping": (0.25 * w, 2.2 * w),
+        "kick": (0.2, 5.0),
+        "kick_radius": (0.02, 1.0),
+        "Q": (0.02, 10.0),
+        "R": (1e-4, 1.0),
+        "a": (0.8 * w, 5.0 * w),
+        "b": (0.5 * w * w, 4.5 * w * w),
+        "half_angle": (0.3, 0.98 * math.pi),
+        "rate": (0.5 * w, 4.0 * w),
+        "level": (0.1 * natural.level, 30.0 * natural.level),
+        "hysteresis": (0.01, 0.3),
+    }
+
+
+def _weights(controller: Hybrid) -> LqrWeights:
+    regulator: Any = controller.regulator
+    weights: LqrWeights = regulator.design
+    return weights
+
+
+def _read(controller: Hybrid, slot: _Slot) -> Any:
+    regulator: Any = controller.regulator
+    if slot.part == "design":
+        value = getattr(regulator.design, slot.name)
+        return np.diagonal(np.asarray(value)) if slot.name == "Q" else value
+    return getattr(getattr(controller, slot.part), slot.name)
+
+
+_BELOW = np.tril_indices(4, -1)
+
+
+def _full(x: jax.Array) -> jax.Array:
+    """Q (4, 4) = D U U' D of x (10,): D's diagonal exp(x[:4]), U lower triangular with ones, x[4:] below them."""
+    U = jnp.eye(4, dtype=x.dtype).at[_BELOW].set(x[4:])
+    L = jnp.exp(x[:4])[:, None] * U
+    return L @ L.T
+
+
+def _from_full(Q: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """The x of which `_full` makes Q; a singular Q is lifted a little."""
+    floor = _LEAST**2 * np.max(np.diagonal(Q))
+    L = np.linalg.cholesky(Q + floor * np.eye(4)) if np.min(np.linalg.eigvalsh(Q)) < floor else np.linalg.cholesky(Q)
+    D = np.diagonal(L)
+    return np.concatenate([np.log(D), (L / D[:, None])[_BELOW]])

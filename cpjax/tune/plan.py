@@ -1,0 +1,136 @@
+"""How a tuning is done: budgets, batches and the curriculum."""
+
+import dataclasses
+import math
+from typing import Any
+
+from cpjax.errors import InputError
+from cpjax.pytree import Number
+from cpjax.sim.settings import check_settings
+from cpjax.starts import START_SETS
+from cpjax.tune.objective import Goal
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """A tuning draws candidates, lets gradients improve the best of them, and keeps what validates best.
+
+    Attributes:
+      starts: the set that starts are drawn from.
+      seed: of everything random. Starts of a tuning are never those that a seed names for `cpjax.sample_starts`.
+      goal: the weights of the objective.
+      candidates: random controllers beside the given one; 0 tunes the given one alone.
+      screening: starts by which candidates are compared, on values alone.
+      restarts: how many of the best are tuned, the given one among them.
+      batch: starts of each step, drawn anew.
+      steps: of the optimiser.
+      explore: after each validation the worse half of the restarts goes on from the better half, with so much noise on
+        the unconstrained parameters; 0 to let all of them be.
+      learning_rate: Adam's, at first; it falls to a twentieth along a cosine.
+      duration: of the tuning's rollouts [s].
+      dt: their step [s].
+      spare_steps: theirs, for crossings; a run that needs more counts up to there.
+      first_width: the target's at first [rad and m].
+      last_width: and after six tenths of the steps, reached geometrically.
+      tail: share of the worst starts that the mean is taken over; 1 for all.
+      clip: a start's gradient is shortened to this many times the batch's median norm.
+      validate_every: steps between validations, each of which may be the last kept.
+      validation: starts of a validation, the same ones each time.
+      patience: validations without a better result after which a tuning ends; 0 for never.
+      finalists: restarts whose best is compared once more in the end.
+      final: starts of that comparison.
+      final_horizon: of its runs [s].
+      final_dt: their step and control period [s].
+      horizon: of screening and validation [s].
+      horizon_dt: their step and control period [s].
+      pole_limit: bound on the fastest pole of the linear closed loop [1/s].
+      plant_spread: every parameter of the plant is drawn within this share of its value, for each start; the law's
+        model is not.
+    """
+
+    starts: str = "hanging"
+    seed: int = 1
+    goal: Goal = dataclasses.field(default_factory=Goal)
+    candidates: int = 512
+    screening: int = 24
+    restarts: int = 8
+    batch: int = 16
+    steps: int = 80
+    explore: float = 0.2
+    learning_rate: float = 0.05
+    duration: float = 4.0
+    dt: float = 0.02
+    spare_steps: int = 32
+    first_width: float = 0.2
+    last_width: float = 0.03
+    tail: float = 1.0
+    clip: float = 2.0
+    validate_every: int = 5
+    validation: int = 192
+    patience: int = 0
+    finalists: int = 2
+    final: int = 1536
+    final_horizon: float = 10.0
+    final_dt: float = 0.002
+    horizon: float = 5.0
+    horizon_dt: float = 0.005
+    pole_limit: float = 250.0
+    plant_spread: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.starts, str) or self.starts not in START_SETS:
+            raise InputError("starts", self.starts, "one of " + ", ".join(START_SETS))
+        if not isinstance(self.goal, Goal):
+            raise InputError("goal", self.goal, "a cpjax.tune Goal")
+        for name, least in _COUNTS.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise InputError(name, value, f"a whole number, at least {least}")
+        for name, rule in _NUMBERS.items():
+            object.__setattr__(self, name, rule.normalise(name, getattr(self, name)))
+        check_settings(self.duration, self.dt, "continuous", None, "located", "rk4", None)
+        for horizon, dt in ((self.horizon, self.horizon_dt), (self.final_horizon, self.final_dt)):
+            check_settings(horizon, dt, "sampled", None, "per_step", "rk4", None)
+        if self.restarts > self.candidates + 1:
+            raise InputError("restarts", self.restarts, f"at most candidates + 1, {self.candidates + 1}")
+
+    def width(self, step: int) -> float:
+        """The target's at a step [rad and m]."""
+        done = min(1.0, step / max(1.0, 0.6 * self.steps))
+        return float(self.first_width * (self.last_width / self.first_width) ** done)
+
+    def table(self) -> dict[str, Any]:
+        """As plain values."""
+        return dataclasses.asdict(self)
+
+
+_COUNTS = {
+    "seed": 0,
+    "candidates": 0,
+    "screening": 1,
+    "spare_steps": 0,
+    "restarts": 1,
+    "batch": 1,
+    "steps": 0,
+    "validate_every": 1,
+    "validation": 1,
+    "patience": 0,
+    "finalists": 1,
+    "final": 1,
+}
+_NUMBERS = {
+    "explore": Number("1", "", at_least=0.0),
+    "learning_rate": Number("1", "", above=0.0, at_most=10.0),
+    "first_width": Number("rad and m", "", above=0.0),
+    "last_width": Number("rad and m", "", above=0.0),
+    "tail": Number("1", "", above=0.0, at_most=1.0),
+    "clip": Number("1", "", above=0.0, infinite=True),
+    "pole_limit": Number("1/s", "", above=0.0, infinite=True),
+    "plant_spread": Number("1", "", at_least=0.0, below=1.0),
+    "duration": Number("s", "", above=0.0, at_most=math.inf),
+    "dt": Number("s", "", above=0.0),
+    "horizon": Number("s", "", above=0.0),
+    "final_horizon": Number("s", "", above=0.0),
+    "final_dt": Number("s", "", above=0.0),
+    "horizon_dt": Number("s", "", above=0.0),
+}

@@ -1,0 +1,419 @@
+"""The tuner: random candidates, gradients through whole swing-ups for the best of them, and a choice by values.
+
+A gradient knows how a swing-up changes while it stays the same kind of swing-up. It does not know that a little farther
+on a catch fails and the pendulum goes round again. Values know that, and they are cheap. So values choose where to
+start and what to keep, and gradients do the work in between.
+"""
+
+import dataclasses
+import io as buffers
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from cpjax import io
+from cpjax.controllers import Hybrid, StateFeedback
+from cpjax.errors import InputError
+from cpjax.numeric.statistics import wilson_interval
+from cpjax.plant import CartPole, linearize
+from cpjax.sim.metrics import Metrics, ProtocolMetrics
+from cpjax.sim.rollout import measure
+from cpjax.starts import sample_starts
+from cpjax.state import State
+from cpjax.tune.objective import tail_mean
+from cpjax.tune.parameters import FreeParameters, Vector
+from cpjax.tune.plan import Plan
+from cpjax.tune.plants import sample_plants
+
+Numbers = np.ndarray[Any, Any]
+Report = Callable[[int, int, str], None]
+
+_FAILURE = 3.0  # what a start that fails counts, in horizons
+_SCREEN, _STEP, _VALIDATE, _FINAL = range(4)
+
+
+@dataclasses.dataclass(frozen=True)
+class Tuning:
+    """What `tune` found.
+
+    Attributes:
+      controller: the best one.
+      vector: its free parameters, unconstrained (d,).
+      labels: their names.
+      physical: and themselves, in SI units.
+      score: by which it was chosen: mean settling time [s], a failure counting ten horizons, and what else has weight.
+      success_rate: on the starts of the last comparison.
+      settling_time: mean over the successes among them [s].
+      history: one record per validation.
+      value_steps: RK4 steps simulated for values alone.
+      gradient_steps: and with a gradient, iterations spent on crossings included.
+      seconds: of this process, compilation included.
+    """
+
+    controller: Hybrid
+    vector: Numbers
+    labels: tuple[str, ...]
+    physical: Numbers
+    score: float
+    success_rate: float
+    settling_time: float
+    history: list[dict[str, Any]]
+    value_steps: int
+    gradient_steps: int
+    seconds: float
+
+
+class _Memory(NamedTuple):
+    """All that a tuning needs to go on: the content of a checkpoint."""
+
+    step: int
+    vectors: Numbers
+    """(r, d)."""
+    optimiser: Any
+    best: Numbers
+    """(r, d)."""
+    scores: Numbers
+    """(r,), of `best`."""
+    stale: int
+    """Validations since the last improvement."""
+    history: list[dict[str, Any]]
+    value_steps: int
+    gradient_steps: int
+
+
+def tune(
+    plant: CartPole,
+    free: FreeParameters,
+    plan: Plan,
+    *,
+    progress: Report | None = None,
+    checkpoint: Path | None = None,
+) -> Tuning:
+    """Tunes the free parameters on `plant`.
+
+    Args:
+      free: what may change, and the controller to begin with.
+      progress: called with the steps done, their number, and loss and success rate in words.
+      checkpoint: a file that is written after each validation. A tuning that finds it goes on from there, and ends in
+        the same bits as one that was never stopped.
+
+    Raises:
+      InputError: a checkpoint of another tuning, or a controller that this plant cannot run.
+    """
+    began = time.perf_counter()
+    tuner = _Tuner(plant, free, plan)
+    say = progress if progress is not None else lambda done, total, text: None
+    memory = _restore(checkpoint, tuner)
+    if memory is None:
+        say(0, plan.steps, f"screening {plan.candidates + 1} candidates")
+        memory = tuner.begin()
+        _store(checkpoint, tuner, memory)
+    while memory.step < plan.steps and not (plan.patience and memory.stale >= plan.patience):
+        last = memory.history[-1]
+        say(
+            memory.step,
+            plan.steps,
+            f"loss {last['loss']:.3f}, success {100 * max(last['success_rates']):.1f} %, best {min(memory.scores):.3f}",
+        )
+        memory = tuner.advance(memory)
+        _store(checkpoint, tuner, memory)
+    say(plan.steps, plan.steps, "last comparison")
+    return tuner.finish(memory, began)
+
+
+class _Tuner:
+    """The compiled pieces."""
+
+    def __init__(self, plant: CartPole, free: FreeParameters, plan: Plan) -> None:
+        self.plant, self.free, self.plan = plant, free, plan
+        schedule = optax.cosine_decay_schedule(plan.learning_rate, max(1, plan.steps), 0.05)
+        self.optimiser = optax.adam(schedule)
+        self.fold = ProtocolMetrics(track_limit=plan.goal.track_limit)
+        self.iterations = round(plan.duration / plan.dt) + plan.spare_steps
+        self.gradient = jax.jit(jax.vmap(self._gradient, in_axes=(0, None, None, None)))
+        self.values = jax.jit(self._values, static_argnames=("horizon", "dt"))
+        document = {
+            "plan": plan.table(),
+            "plant": io.encode(plant),
+            "controller": io.encode(free.controller),
+            "free": [slot._asdict() for slot in free.slots],
+            "versions": io.versions(),
+        }
+        self.identity = io.dump_json(document)
+
+    def begin(self) -> _Memory:
+        """Screens the candidates; the first restart is the given controller."""
+        plan = self.plan
+        given = np.asarray(self.free.start())[None]
+        random = np.random.default_rng(_seed(plan, _SCREEN, 1))
+        vectors = np.concatenate([given, self.free.draw(random, plan.candidates).astype(given.dtype)])
+        scores, _, _ = self._score(vectors, plan.screening, _SCREEN)
+        order = [0, *(int(i) for i in np.argsort(scores, kind="stable") if i != 0)][: plan.restarts]
+        chosen = vectors[order]
+        steps = len(vectors) * plan.screening * self._horizon_steps
+        start = _Memory(
+            0, chosen, self.optimiser.init(jnp.asarray(chosen)), chosen, np.full(len(chosen), np.inf), 0, [], steps, 0
+        )
+        return self._validate(start, np.nan)
+
+    def advance(self, memory: _Memory) -> _Memory:
+        """Up to the next validation."""
+        plan = self.plan
+        vectors, state = jnp.asarray(memory.vectors), memory.optimiser
+        end = min(memory.step + plan.validate_every, plan.steps)
+        loss = jnp.full(vectors.shape[0], jnp.nan)
+        for step in range(memory.step, end):
+            starts, plants = self._draw(plan.batch, _STEP, step)
+            loss, slope = self.gradient(vectors, starts, plants, jnp.asarray(plan.width(step), vectors.dtype))
+            with jax.numpy_dtype_promotion("standard"):  # optax's own arithmetic mixes dtypes
+                change, state = self.optimiser.update(slope, state)
+                moved = optax.apply_updates(vectors, change)
+            vectors = jnp.where(jnp.isfinite(moved), moved, vectors)
+        spent = (end - memory.step) * vectors.shape[0] * plan.batch * self.iterations
+        memory = memory._replace(
+            step=end, vectors=np.asarray(vectors), optimiser=state, gradient_steps=memory.gradient_steps + spent
+        )
+        memory = self._validate(memory, float(jnp.min(loss)))
+        return self._select(memory) if memory.step < plan.steps else memory
+
+    def _select(self, memory: _Memory) -> _Memory:
+        """The worse half goes on from the best of the better half, a little aside (Jaderberg and others, 2017)."""
+        plan = self.plan
+        order = np.argsort(memory.scores, kind="stable")
+        half = len(order) // 2
+        if half == 0 or plan.explore == 0.0:
+            return memory
+        losers, winners = order[len(order) - half :], order[:half]
+        random = np.random.default_rng(_seed(plan, _STEP, 2 * memory.step + 1))
+        noise = plan.explore * random.standard_normal((half, memory.best.shape[1]))
+        vectors, best, scores = (np.array(x) for x in (memory.vectors, memory.best, memory.scores))
+        vectors[losers] = memory.best[winners] + noise.astype(vectors.dtype)
+        best[losers], scores[losers] = vectors[losers], np.inf
+
+        def inherited(leaf: jax.Array) -> jax.Array:
+            return leaf.at[losers].set(leaf[winners]) if leaf.ndim == 2 else leaf
+
+        return memory._replace(
+            vectors=vectors, best=best, scores=scores, optimiser=jax.tree.map(inherited, memory.optimiser)
+        )
+
+    def finish(self, memory: _Memory, began: float) -> Tuning:
+        """Compares the best restarts on more starts and takes the best of them."""
+        plan = self.plan
+        chosen = np.argsort(memory.scores, kind="stable")[: plan.finalists]
+        scores, rates, times = self._score(memory.best[chosen], plan.final, _FINAL)
+        best = int(np.argmin(scores))
+        vector = memory.best[chosen[best]]
+        return Tuning(
+            controller=jax.tree.map(np.asarray, self.free.build(jnp.asarray(vector))),
+            vector=vector,
+            labels=self.free.labels,
+            physical=np.asarray(self.free.physical(jnp.asarray(vector))),
+            score=float(scores[best]),
+            success_rate=float(rates[best]),
+            settling_time=float(times[best]),
+            history=memory.history,
+            value_steps=memory.value_steps + len(chosen) * plan.final * round(plan.final_horizon / plan.final_dt),
+            gradient_steps=memory.gradient_steps,
+            seconds=time.perf_counter() - began,
+        )
+
+    def _validate(self, memory: _Memory, loss: float) -> _Memory:
+        plan = self.plan
+        scores, rates, times = self._score(memory.vectors, plan.validation, _VALIDATE)
+        better = scores < memory.scores
+        record = {
+            "step": memory.step,
+            "width": plan.width(memory.step),
+            "loss": loss,
+            "scores": scores.tolist(),
+            "success_rates": rates.tolist(),
+            "settling_times": times.tolist(),
+        }
+        improved = bool(np.min(scores) < np.min(memory.scores))
+        return memory._replace(
+            best=np.where(better[:, None], memory.vectors, memory.best),
+            scores=np.where(better, scores, memory.scores),
+            stale=0 if improved else memory.stale + 1,
+            history=[*memory.history, record],
+            value_steps=memory.value_steps + len(scores) * plan.validation * self._horizon_steps,
+        )
+
+    @property
+    def _horizon_steps(self) -> int:
+        return round(self.plan.horizon / self.plan.horizon_dt)
+
+    def _draw(self, count: int, purpose: int, step: int = 0) -> tuple[State, CartPole | None]:
+        plan = self.plan
+        dtype = np.dtype(jnp.result_type(float))
+        starts = sample_starts(plan.starts, count, seed=_seed(plan, purpose, 2 * step), dtype=dtype)
+        plants = None
+        if plan.plant_spread > 0.0:
+            drawn = sample_plants(self.plant, count, spread=plan.plant_spread, seed=_seed(plan, purpose, 2 * step + 1))
+            plants = jax.tree.map(lambda column: jnp.asarray(column, dtype), drawn)
+        return jax.tree.map(jnp.asarray, starts), plants
+
+    def _gradient(self, vector: Vector, starts: State, plants: CartPole | None, width: jax.Array) -> Any:
+        """Loss and gradient of one restart, with no start's sensitivity drowning the others'."""
+        plan = self.plan
+
+        def objective(vector: Vector, start: State, plant: CartPole) -> jax.Array:
+            value: jax.Array = measure(
+                plant,
+                self.free.build(vector),
+                start,
+                duration=plan.duration,
+                dt=plan.dt,
+                switching="located",
+                spare_steps=plan.spare_steps,
+                metrics=plan.goal.fold(self.free.controller.swing_up.model, width),  # type: ignore[attr-defined]
+            )
+            return value
+
+        value_and_grad = jax.value_and_grad(objective)
+        if plants is None:
+            values, slopes = jax.vmap(lambda start: value_and_grad(vector, start, self.plant))(starts)
+        else:
+            values, slopes = jax.vmap(lambda start, plant: value_and_grad(vector, start, plant))(starts, plants)
+        sound = jnp.all(jnp.isfinite(slopes), axis=1) & jnp.isfinite(values)
+        slopes = jnp.where(sound[:, None], slopes, 0.0)
+        norms = jnp.sqrt(jnp.sum(slopes * slopes, axis=1))
+        median = jnp.nan_to_num(jnp.nanmedian(jnp.where(sound, norms, jnp.nan)))
+        tiny = float(np.finfo(norms.dtype).tiny)
+        shortened = jnp.minimum(1.0, plan.clip * median / jnp.maximum(norms, tiny))
+        worst = jnp.max(jnp.where(sound, values, -jnp.inf))
+        values = jnp.where(sound, values, worst)
+        loss, shares = jax.value_and_grad(tail_mean(plan.tail))(values)
+        slope = jnp.sum((shares * shortened)[:, None] * slopes, axis=0)
+        hurry = jnp.nan_to_num(jax.grad(self._haste)(vector))
+        return loss, slope + hurry
+
+    def _haste(self, vector: Vector) -> jax.Array:
+        """Grows once the bound on the fastest closed-loop pole is near its limit."""
+        excess = jnp.log(self._pole_bound(vector) / (0.9 * self.plan.pole_limit))
+        return 10.0 * jnp.maximum(excess, 0.0) ** 2
+
+    def _pole_bound(self, vector: Vector) -> jax.Array:
+        """At least the magnitude of the fastest pole, at most twice that (Fujiwara, 1916) [1/s]."""
+        controller = self.free.build(vector)
+        A, B = linearize(controller.swing_up.model)  # type: ignore[attr-defined]  # an energy law
+        regulator = controller.regulator
+        assert isinstance(regulator, StateFeedback)
+        return fastest_pole_bound(A - B @ jnp.asarray(regulator.K))
+
+    def _score(self, vectors: Numbers, count: int, purpose: int) -> tuple[Numbers, Numbers, Numbers]:
+        """Score, success rate and mean settling time of each vector."""
+        starts, plants = self._draw(count, purpose)
+        plan = self.plan
+        horizon, dt = (plan.final_horizon, plan.final_dt) if purpose == _FINAL else (plan.horizon, plan.horizon_dt)
+        scores, rates, times = self.values(jnp.asarray(vectors), starts, plants, horizon=horizon, dt=dt)
+        return np.asarray(scores), np.asarray(rates), np.asarray(times)
+
+    def _values(self, vectors: jax.Array, starts: State, plants: CartPole | None, *, horizon: float, dt: float) -> Any:
+        plan, goal = self.plan, self.plan.goal
+
+        def one(vector: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
+            controller = self.free.build(vector)
+
+            def run(start: State, plant: CartPole) -> Metrics:
+                found: Metrics = measure(
+                    plant,
+                    controller,
+                    start,
+                    duration=horizon,
+                    dt=dt,
+                    clock="sampled",
+                    metrics=self.fold,
+                )
+                return found
+
+            runs = (
+                jax.vmap(lambda start: run(start, self.plant))(starts)
+                if plants is None
+                else jax.vmap(run)(starts, plants)
+            )
+            cost = jnp.where(runs.success, runs.settling_time, _FAILURE * horizon)
+            cost = cost + goal.effort * runs.effort + goal.jerkiness * runs.voltage_variation
+            rate = jnp.mean(runs.success.astype(cost.dtype))
+            settled = jnp.mean(jnp.where(runs.success, runs.settling_time, 0.0)) / rate  # NaN without a success
+            slow = self._pole_bound(vector) <= 2.0 * plan.pole_limit  # the bound is up to twice the pole
+            score = jnp.where(slow, jnp.mean(cost), jnp.inf)
+            return jnp.where(jnp.isnan(score), jnp.inf, score), rate, settled
+
+        lanes = max(1, 512 // jnp.shape(starts.x)[0])
+        return jax.lax.map(one, vectors, batch_size=min(lanes, vectors.shape[0]))
+
+
+def fastest_pole_bound(A: jax.Array) -> jax.Array:
+    """A bound on the largest eigenvalue's magnitude of A (4, 4), at most twice that: 2 max |c_k|^(1/k) over the
+    coefficients of its characteristic polynomial (Fujiwara, 1916), which are made by Faddeev and LeVerrier's method.
+    """
+    identity = jnp.eye(4, dtype=A.dtype)
+    M, bound = identity, jnp.zeros((), A.dtype)
+    for k in range(1, 5):
+        c = -jnp.trace(A @ M) / k
+        M = A @ M + c * identity
+        size = jnp.maximum(jnp.abs(c), float(np.finfo(A.dtype).tiny))
+        bound = jnp.maximum(bound, size ** (1.0 / k))
+    return 2.0 * bound
+
+
+def _seed(plan: Plan, purpose: int, step: int) -> int:
+    """A seed that no person types in: of starts that no evaluation uses."""
+    return 2**32 + int(np.random.SeedSequence([plan.seed, purpose, step]).generate_state(1)[0])
+
+
+def _store(path: Path | None, tuner: _Tuner, memory: _Memory) -> None:
+    if path is None:
+        return
+    leaves = jax.tree.leaves(memory.optimiser)
+    arrays = {f"optimiser_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+    arrays |= {name: getattr(memory, name) for name in ("vectors", "best", "scores")}
+    counts = {name: getattr(memory, name) for name in ("step", "stale", "value_steps", "gradient_steps")}
+    note = json.dumps({"identity": tuner.identity, "history": memory.history, **counts})
+    buffer = buffers.BytesIO()
+    arrays["note"] = np.frombuffer(note.encode(), dtype=np.uint8)
+    np.savez(buffer, allow_pickle=False, **arrays)
+    io.write_bytes(path, buffer.getvalue())
+
+
+def _restore(path: Path | None, tuner: _Tuner) -> _Memory | None:
+    if path is None or not path.exists():
+        return None
+    try:
+        with np.load(path) as content:
+            arrays = {name: content[name] for name in content.files}
+        note = json.loads(arrays.pop("note").tobytes())
+        blank = tuner.optimiser.init(jnp.asarray(arrays["vectors"]))
+        leaves = [jnp.asarray(arrays[f"optimiser_{i}"]) for i in range(len(jax.tree.leaves(blank)))]
+    except (OSError, ValueError, KeyError, EOFError) as problem:
+        raise InputError("checkpoint", str(path), f"a file written by a tuning, or none ({problem})") from problem
+    if note.pop("identity") != tuner.identity:
+        allowed = "one of the same tuning (plan, plant, controller, versions); remove it, or choose another folder"
+        raise InputError("checkpoint", str(path), allowed)
+    optimiser = jax.tree.unflatten(jax.tree.structure(blank), leaves)
+    parts = {name: arrays[name] for name in ("vectors", "best", "scores")}
+    return _Memory(optimiser=optimiser, **parts, **note)
+
+
+def document(tuning: Tuning, plant: CartPole, plan: Plan, **others: Any) -> dict[str, Any]:
+    """The result for programs; its controller is also a file of its own."""
+    fields = {f.name: getattr(tuning, f.name) for f in dataclasses.fields(tuning) if f.name != "controller"}
+    low, high = wilson_interval(round(tuning.success_rate * plan.final), plan.final)
+    return {
+        "what": "a tuning by gradients through swing-ups",
+        "versions": io.versions(),
+        "plan": plan.table(),
+        "plant": io.encode(plant),
+        "controller": io.encode(tuning.controller),
+        "success_interval": [low, high],
+        **fields,
+        **others,
+    }
