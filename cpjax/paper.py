@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from cpjax.controllers.energy import EnergySwingUp
-from cpjax.controllers.feedback import StateFeedback
+from cpjax.controllers.feedback import LqrWeights, PoleFactors, StateFeedback
 from cpjax.controllers.gates import AngleGate
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import Law
@@ -179,7 +179,19 @@ def regulator(design: Design, gains: Gains, plant: CartPole) -> StateFeedback:
     """
     _check_choice("design", design, get_args(Design))
     _check_choice("gains", gains, get_args(Gains))
-    return StateFeedback(computed_gain(design, plant) if gains == "computed" else np.array([PRINTED_GAINS[design]]))
+    if gains == "printed":
+        return StateFeedback(np.array([PRINTED_GAINS[design]]))
+    return StateFeedback(computed_gain(design, plant), design=design_inputs(design))
+
+
+def design_inputs(design: Design) -> LqrWeights | PoleFactors:
+    """What section IV designs the gain from: its weights, or its poles."""
+    _check_choice("design", design, get_args(Design))
+    if design == "lqr":
+        return LqrWeights(np.diag(Q), R)
+    return PoleFactors(
+        np.array([-POLES[0] - POLES[1], -POLES[2] - POLES[3]]), np.array([POLES[0] * POLES[1], POLES[2] * POLES[3]])
+    )
 
 
 def controller(law: str, design: Design, plant: CartPole, gains: Gains = "printed") -> Hybrid:

@@ -14,11 +14,20 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from cpjax import io, paper
-from cpjax.controllers import AngleGate, AngleRateGate, EnergySwingUp, Hybrid, LyapunovGate, StateFeedback
+from cpjax.controllers import (
+    AngleGate,
+    AngleRateGate,
+    EnergySwingUp,
+    Hybrid,
+    LqrWeights,
+    LyapunovGate,
+    PoleFactors,
+    StateFeedback,
+)
 from cpjax.controllers.gates import Gate
 from cpjax.controllers.protocol import Controller, as_controller
 from cpjax.design.lqr import lqr
-from cpjax.design.placement import place
+from cpjax.design.placement import QuadraticFactors, place
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor, linearize
 from cpjax.pytree import Number, rules
@@ -50,7 +59,8 @@ class Option:
         return "--" + (self.flag or self.key.replace("_", "-"))
 
 
-def _numbers_of(section: str, cls: type, keys: Sequence[str] | None = None) -> list[Option]:
+def numbers_of(section: str, cls: type, keys: Sequence[str] | None = None) -> list[Option]:
+    """An option for each number of a class, or for those named."""
     chosen = {k: r for k, r in rules(cls).items() if isinstance(r, Number) and (keys is None or k in keys)}
     return [Option(section, key, f"{rule.help} [{rule.unit}]", float) for key, rule in chosen.items()]
 
@@ -64,8 +74,8 @@ _GATES: Mapping[str, type[AngleGate | AngleRateGate | LyapunovGate]] = {
 
 PLANT_OPTIONS = [
     Option("plant", "base", f"{_PLANTS}, or a file; other plant options change it (default appendix)", flag="plant"),
-    *_numbers_of("plant", CartPole),
-    *_numbers_of("plant", Motor),
+    *numbers_of("plant", CartPole),
+    *numbers_of("plant", Motor),
 ]
 
 CONTROLLER_OPTIONS = [
@@ -82,15 +92,15 @@ CONTROLLER_OPTIONS = [
     Option("controller", "R", "and the weight of the voltage (default the paper's 1e-4)", float, flag="r"),
     Option("controller", "poles", "placement for the plant: poles, such as -3 -4 -5+2j -5-2j", count=4, numbers=True),
     Option("controller", "K", "the regulator's gain itself, instead of all these", float, count=4, flag="gain"),
-    *_numbers_of("controller", EnergySwingUp),
+    *numbers_of("controller", EnergySwingUp),
     Option(
         "controller",
         "gate",
         "where the regulator takes over (default angle); lyapunov: a level set of the LQR of q, r; needs --level",
         choices=tuple(_GATES),
     ),
-    *_numbers_of("controller", AngleRateGate),
-    *_numbers_of("controller", LyapunovGate, ["level"]),
+    *numbers_of("controller", AngleRateGate),
+    *numbers_of("controller", LyapunovGate, ["level"]),
     Option("controller", "reference_x", "where the cart is to be held (default 0) [m]", float),
 ]
 
@@ -250,13 +260,22 @@ def _build_regulator(changes: dict[str, Any], plant: CartPole, reference: State)
         if given.get("gains", "computed") != "computed":
             raise InputError("gains", given["gains"], f"computed, where {inputs} are given")
         if "poles" in given:
-            K = _designed("gain", plant, lambda A, B: place(A, B, parse_poles(given["poles"])))
-        else:
-            K = _designed("gain", plant, lambda A, B: lqr(A, B, *_weights(weights)).K)
-        return StateFeedback(K, reference)
-    return StateFeedback(
-        paper.regulator(given.get("design", "placement"), given.get("gains", "printed"), plant).K, reference
-    )
+            poles = parse_poles(given["poles"])
+            K = _designed("gain", plant, lambda A, B: place(A, B, poles))
+            return StateFeedback(K, reference, _factors(poles))
+        Q, R = _weights(weights)
+        K = _designed("gain", plant, lambda A, B: lqr(A, B, Q, R).K)
+        return StateFeedback(K, reference, LqrWeights(Q, R[0][0]))
+    regulator = paper.regulator(given.get("design", "placement"), given.get("gains", "printed"), plant)
+    return dataclasses.replace(regulator, reference=reference)
+
+
+def _factors(poles: Sequence[complex]) -> PoleFactors | None:
+    """The design of a placement, if it can be one to tune: stable poles."""
+    if not all(pole.real < 0.0 for pole in poles):
+        return None
+    factors = QuadraticFactors.from_poles(poles)
+    return PoleFactors(np.asarray(factors.a), np.asarray(factors.b))
 
 
 def _designed(what: str, plant: CartPole, design: Callable[[Any, Any], Any]) -> Any:

@@ -25,7 +25,7 @@ class Plan:
       batch: starts of each step, drawn anew.
       steps: of the optimiser.
       explore: after each validation the worse half of the restarts goes on from the better half, with so much noise on
-        the unconstrained parameters; 0 to let all of them be.
+        the unconstrained parameters, less and less towards the end; 0 to let all of them be.
       learning_rate: Adam's, at first; it falls to a twentieth along a cosine.
       duration: of the tuning's rollouts [s].
       dt: their step [s].
@@ -51,8 +51,8 @@ class Plan:
     starts: str = "hanging"
     seed: int = 1
     goal: Goal = dataclasses.field(default_factory=Goal)
-    candidates: int = 512
-    screening: int = 24
+    candidates: int = 1024
+    screening: int = 16
     restarts: int = 8
     batch: int = 16
     steps: int = 80
@@ -66,10 +66,10 @@ class Plan:
     tail: float = 1.0
     clip: float = 2.0
     validate_every: int = 5
-    validation: int = 192
+    validation: int = 128
     patience: int = 0
     finalists: int = 2
-    final: int = 1536
+    final: int = 1024
     final_horizon: float = 10.0
     final_dt: float = 0.002
     horizon: float = 5.0

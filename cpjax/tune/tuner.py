@@ -192,7 +192,8 @@ class _Tuner:
             return memory
         losers, winners = order[len(order) - half :], order[:half]
         random = np.random.default_rng(_seed(plan, _STEP, 2 * memory.step + 1))
-        noise = plan.explore * random.standard_normal((half, memory.best.shape[1]))
+        size = plan.explore * (1.0 - memory.step / plan.steps)
+        noise = size * random.standard_normal((half, memory.best.shape[1]))
         vectors, best, scores = (np.array(x) for x in (memory.vectors, memory.best, memory.scores))
         vectors[losers] = memory.best[winners] + noise.astype(vectors.dtype)
         best[losers], scores[losers] = vectors[losers], np.inf

@@ -1,0 +1,112 @@
+"""`cpjax compare`: the paper's gains against tuned ones, as a table, pictures and JSON."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cpjax import io
+from cpjax.cli.options import EVALUATION_OPTIONS, PLANT_OPTIONS, Option, add_options, build_plant, resolve
+from cpjax.cli.progress import progress
+from cpjax.cli.tables import print_table
+from cpjax.controllers import Hybrid
+from cpjax.errors import InputError
+from cpjax.plant import CartPole
+from cpjax.sim.rollout import Trajectory, rollout
+from cpjax.state import NAMES, State
+from cpjax.study.comparison import PRESETS, Compared, best, compare, document, entries
+from cpjax.study.reproduction import DESIGNS, Setting
+
+OPTIONS = [
+    *PLANT_OPTIONS,
+    *EVALUATION_OPTIONS,
+    Option("tuned", "lqr", "a file of `cpjax tune`, instead of the one that comes with cpjax", flag="tuned-lqr"),
+    Option("tuned", "placement", "the same for pole placement", flag="tuned-placement"),
+    Option("tuned", "track_limit", "leaving |x| within it is failure (default none) [m]", float),
+]
+
+
+def add_command(commands: Any) -> None:
+    """Declares the command."""
+    text = (
+        "The paper's gains, as printed and as computed, with its law as printed and as corrected, against tuned "
+        "controllers, over the same starts. Writes compare.json, responses.png and by_start.png."
+    )
+    parser = commands.add_parser("compare", help="the paper's gains against tuned ones", description=text)
+    add_options(parser, OPTIONS, out="out/compare")
+    parser.set_defaults(run=run)
+
+
+def run(given: argparse.Namespace) -> int:
+    """Runs the command."""
+    sections = resolve(given, OPTIONS)
+    plant = build_plant(sections["plant"])
+    setting = Setting(seed=given.seed, **sections["evaluation"])
+    files = dict(sections["tuned"])
+    limit = files.pop("track_limit", float("inf"))
+    tuned = {design: _loaded(design, path) for design, path in files.items()}
+    results = compared(given.out, plant, setting, tuned, limit)
+
+    from cpjax.show.comparison import findings
+
+    print_results(results)
+    print(*findings(results), sep="\n")
+    print(f"wrote {given.out / 'compare.json'} and the pictures beside it")
+    return 0
+
+
+def compared(
+    out: Path, plant: CartPole, setting: Setting, tuned: dict[str, Hybrid], track_limit: float = float("inf")
+) -> list[Compared]:
+    """The comparison, with its JSON and pictures written; `tuned` by design, what is missing from the presets."""
+    from cpjax.study.comparison import preset
+
+    chosen = {design: tuned.get(design) or preset(design) for design in DESIGNS}
+    with progress("compare") as report:
+        starts, results = compare(
+            plant, entries(plant, {f"tuned, {name}": c for name, c in chosen.items()}), setting,
+            track_limit=track_limit, progress=report,
+        )  # fmt: skip
+    io.write_json(out / "compare.json", document(plant, results, setting, track_limit=track_limit))
+
+    from cpjax.show.comparison import by_start, responses
+    from cpjax.show.figures import save_figure
+
+    runs = representative_runs(plant, starts, results, setting)
+    until = min(8.0, setting.duration)
+    save_figure(out / "responses.png", responses(runs, until, float(plant.motor.voltage_limit)))
+    save_figure(out / "by_start.png", by_start(starts, results))
+    return results
+
+
+def representative_runs(
+    plant: CartPole, starts: State, results: list[Compared], setting: Setting
+) -> dict[tuple[str, str], Trajectory]:
+    """From the first start that all four of the shown controllers catch, or else from the first one."""
+    shown = {
+        (kind, design): best(results, design, tuned=kind == "tuned")
+        for kind in ("paper", "tuned")
+        for design in DESIGNS
+    }
+    caught = np.all([np.asarray(one.metrics.success) for one in shown.values()], axis=0)
+    index = int(np.argmax(caught))
+    start = State(*(float(np.asarray(getattr(starts, name))[index]) for name in NAMES))
+    return {
+        key: rollout(plant, one.entry.controller, start, duration=setting.duration, dt=setting.dt, clock="sampled")
+        for key, one in shown.items()
+    }
+
+
+def print_results(results: list[Compared]) -> None:
+    """The table for people."""
+    from cpjax.show.comparison import HEADER, cells
+
+    print_table("Means over the successful runs", HEADER, map(cells, results), text_columns=3)
+
+
+def _loaded(design: str, path: str) -> Hybrid:
+    loaded = io.load(path)
+    if not isinstance(loaded, Hybrid):
+        raise InputError(f"tuned-{design}", path, f"a file that holds a Hybrid, such as {PRESETS['lqr']}")
+    return loaded

@@ -1,0 +1,108 @@
+"""`cpjax tune`: a controller tuned by gradients through swing-ups; a file that every other command takes."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cpjax import io, paper
+from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, numbers_of, resolve
+from cpjax.cli.progress import progress
+from cpjax.cli.tables import print_table
+from cpjax.controllers import Hybrid
+from cpjax.errors import InputError
+from cpjax.starts import START_SETS
+from cpjax.tune.objective import Goal
+from cpjax.tune.parameters import free_parameters
+from cpjax.tune.plan import Plan
+from cpjax.tune.starting import beginning
+from cpjax.tune.tuner import document, tune
+
+_DEFAULTS = {field.name: field.default for field in dataclasses.fields(Plan)}
+_PLANNED = {
+    "candidates": "random controllers to choose restarts from",
+    "restarts": "controllers that are tuned side by side",
+    "batch": "starts of a step",
+    "steps": "of the optimiser",
+    "learning_rate": "Adam's, at first",
+    "duration": "of the tuning's rollouts [s]",
+    "dt": "their step [s]",
+    "first_width": "of the target, at first [rad and m]",
+    "last_width": "of the target, in the end [rad and m]",
+    "tail": "share of the worst starts that the mean is taken over",
+    "explore": "noise when the worse half of the restarts goes on from the better",
+    "patience": "validations without progress after which to end; 0 for never",
+    "plant_spread": "draw each start's plant within this share about the given one",
+}
+OPTIONS = [
+    *PLANT_OPTIONS,
+    Option("tune", "design", "of the regulator (default lqr)", choices=("lqr", "placement")),
+    Option("tune", "start_from", "bland, paper, or a file with a controller that knows its design (default bland)"),
+    Option("tune", "frozen", "parameters to leave as they are, with commas between"),
+    Option("tune", "free", "the only parameters to change, with commas between"),
+    Option("tune", "full_q", "a full state weight (default diagonal)", choices=("full", "diagonal"), flag="q-shape"),
+    Option("tune", "starts", "set of starts (default hanging)", choices=START_SETS),
+    *(
+        Option("tune", name, f"{text} (default {_DEFAULTS[name]:g})", type(_DEFAULTS[name]))
+        for name, text in _PLANNED.items()
+    ),
+    *numbers_of("goal", Goal),
+]
+
+
+def add_command(commands: Any) -> None:
+    """Declares the command."""
+    text = (
+        "Tunes energy gain, cart terms, gate and Q or poles together, by gradients through whole swing-ups. Writes "
+        "tuned.json (for --controller of other commands), tune.json and tune.png. An interrupted run goes on where it "
+        "stopped, from checkpoint.npz in the same folder."
+    )
+    parser = commands.add_parser("tune", help="a controller tuned by gradients", description=text)
+    add_options(parser, OPTIONS, out="out/tune")
+    parser.set_defaults(run=run)
+
+
+def run(given: argparse.Namespace) -> int:
+    """Runs the command."""
+    sections = resolve(given, OPTIONS)
+    plant = build_plant(sections["plant"])
+    setting = dict(sections["tune"])
+    design: paper.Design = setting.pop("design", "lqr")
+    controller = _begin(setting.pop("start_from", "bland"), design, plant)
+    names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}
+    free = free_parameters(controller, **names, full_q=setting.pop("full_q", "diagonal") == "full")
+    plan = Plan(seed=given.seed, goal=Goal(**sections["goal"]), **setting)
+    with progress("tune") as report:
+        tuning = tune(plant, free, plan, progress=report, checkpoint=given.out / "checkpoint.npz")
+    io.save(given.out / "tuned.json", tuning.controller)
+    io.write_json(given.out / "tune.json", document(tuning, plant, plan, seed=given.seed))
+
+    from cpjax.show.figures import save_figure
+    from cpjax.show.tuning import picture
+
+    save_figure(given.out / "tune.png", picture(tuning))
+    before = np.asarray(free.physical(free.start()))
+    rows = [(label, f"{a:.4g}", f"{b:.4g}") for label, a, b in zip(tuning.labels, before, tuning.physical, strict=True)]
+    print_table("Parameters, SI units", ("parameter", "start", "tuned"), rows, text_columns=1)
+    print(
+        f"{100 * tuning.success_rate:.2f} % of {plan.final} starts settle, after {tuning.settling_time:.3f} s on "
+        f"average; {tuning.value_steps / 1e6:.1f} M steps of values, {tuning.gradient_steps / 1e6:.2f} M of gradients, "
+        f"{tuning.seconds:.0f} s"
+    )
+    print(f"wrote {given.out / 'tuned.json'}, tune.json and tune.png")
+    return 0
+
+
+def _begin(name: str, design: paper.Design, plant: Any) -> Hybrid:
+    if Path(name).suffix.lower() not in (".json", ".toml"):
+        return beginning(name, design, plant)  # type: ignore[arg-type]  # it checks the name
+    loaded = io.load(name)
+    if not isinstance(loaded, Hybrid):
+        raise InputError("start_from", name, "a file that holds a Hybrid")
+    return loaded
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")]

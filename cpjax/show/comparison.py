@@ -1,0 +1,129 @@
+"""A comparison of controllers as a table and pictures."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cpjax.numeric.statistics import two_proportion_p_value
+from cpjax.numeric.trigonometry import wrap_angle
+from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES
+from cpjax.sim.rollout import Trajectory
+from cpjax.state import State
+from cpjax.study.comparison import Compared, best
+from cpjax.study.reproduction import DESIGNS
+
+HEADER = (
+    "controller",
+    "regulator",
+    "gains",
+    "success [%]",
+    "95 % interval",
+    "settling [s]",
+    "its maximum [s]",
+    "travel [m]",
+    "effort [V^2 s]",
+    "variation of u [V]",
+    "peak x'' [m/s^2]",
+)
+
+
+def cells(one: Compared) -> list[str]:
+    """A row of the table: means over the successful runs, and the longest settling time."""
+    good: Mapping[str, Any] = one.summary["over_successes"]
+    low, high = one.summary["success_interval"]
+
+    def text(name: str, digits: int, what: str = "mean") -> str:
+        value = good[name][what]
+        return f"{value:.{digits}f}" if value == value else "-"
+
+    return [
+        one.entry.name,
+        DESIGN_NAMES[one.entry.design],
+        one.entry.gains,
+        f"{100 * one.summary['success_rate']:.2f}",
+        f"{100 * low:.2f}-{100 * high:.2f}",
+        text("settling_time", 2),
+        text("settling_time", 2, "max"),
+        text("cart_travel", 2),
+        text("effort", 0),
+        text("voltage_variation", 0),
+        text("peak_cart_acceleration", 1),
+    ]
+
+
+def findings(results: Sequence[Compared]) -> list[str]:
+    """The paper's own question, answered for its gains and for tuned ones."""
+    return [_answer(results, tuned=False), _answer(results, tuned=True)]
+
+
+def _answer(results: Sequence[Compared], *, tuned: bool) -> str:
+    a, b = (best(results, design, tuned=tuned) for design in DESIGNS)
+    kind = "Tuned" if tuned else "With the paper's gains and laws, the better of each"
+    p = two_proportion_p_value(a.summary["successes"], a.summary["count"], b.summary["successes"], b.summary["count"])
+    verdict = "a difference" if p < 1e-3 else "no difference at 99.9 %"
+
+    def words(one: Compared) -> str:
+        good = one.summary["over_successes"]
+        return (
+            f"{DESIGN_NAMES[one.entry.design]} catches {100 * one.summary['success_rate']:.2f} % of the starts, "
+            f"settles after {good['settling_time']['mean']:.2f} s, uses {good['cart_travel']['mean']:.2f} m and "
+            f"{good['effort']['mean']:.0f} V^2 s, and moves the voltage by {good['voltage_variation']['mean']:.0f} V"
+        )
+
+    return f"{kind}: {words(a)}; {words(b)} ({verdict} in success)."
+
+
+def responses(runs: Mapping[tuple[str, str], Trajectory], until: float, limit: float) -> Figure:
+    """Angle, cart and voltage of the paper's and the tuned controllers from one start, the designs side by side."""
+    figure = Figure(figsize=(12, 8), layout="constrained")
+    axes = figure.subplots(3, 2, sharex=True, sharey="row")
+    for column, design in enumerate(DESIGNS):
+        for kind, style in (("paper", "--"), ("tuned", "-")):
+            run = runs[kind, design]
+            time = np.asarray(run.time)
+            colour = DESIGN_COLOURS[design] if kind == "tuned" else "#777777"
+            series = (wrapped(run.state), np.asarray(run.state.x), np.asarray(run.voltage))
+            for row, values in enumerate(series):
+                axes[row, column].plot(time, values, style, color=colour, label=kind, linewidth=1.3)
+        axes[0, column].set_title(DESIGN_NAMES[design])
+        axes[2, column].set_xlabel("time [s]")
+        axes[2, column].set_xlim(0, until)
+        for sign in (-1, 1):
+            axes[2, column].axhline(sign * limit, color="0.4", linewidth=0.8, linestyle=":")
+        for row in range(3):
+            axes[row, column].grid(alpha=0.3)
+        axes[0, column].legend(frameon=False)
+    for row, label in enumerate((r"$\theta$, modulo a turn [rad]", "x [m]", "voltage [V]")):
+        axes[row, 0].set_ylabel(label)
+    axes[1, 0].set_ylim(-2.0, 2.0)
+    return figure
+
+
+def wrapped(state: State) -> np.ndarray[Any, Any]:
+    """theta modulo a turn, with gaps where it jumps."""
+    theta = np.asarray(wrap_angle(state.theta)).copy()
+    theta[1:][np.abs(np.diff(theta)) > np.pi] = np.nan
+    return theta
+
+
+def by_start(starts: State, results: Sequence[Compared]) -> Figure:
+    """Settling time of every start over its angle and rate; failures as crosses."""
+    figure = Figure(figsize=(12, 6.5), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True, sharey=True)
+    theta, rate = np.asarray(starts.theta), np.asarray(starts.theta_dot)
+    drawn: Any = None
+    for column, design in enumerate(DESIGNS):
+        for row, tuned in enumerate((False, True)):
+            one, panel = best(results, design, tuned=tuned), axes[row, column]
+            good = np.asarray(one.metrics.success)
+            time = np.asarray(one.metrics.settling_time)
+            drawn = panel.scatter(theta[good], rate[good], c=time[good], s=5, cmap="viridis", vmin=1.5, vmax=10.0)
+            panel.plot(theta[~good], rate[~good], "x", color="#D55E00", markersize=3, alpha=0.6)
+            panel.set_title(f"{one.entry.name}, {DESIGN_NAMES[design]}, {one.entry.gains} gains", fontsize="medium")
+        axes[1, column].set_xlabel(r"$\theta$ at the start [rad]")
+    for row in range(2):
+        axes[row, 0].set_ylabel(r"$\dot\theta$ at the start [rad/s]")
+    figure.colorbar(drawn, ax=axes, label="settling time [s] (x: fails)")
+    return figure

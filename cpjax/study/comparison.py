@@ -1,0 +1,140 @@
+"""Tuned controllers beside the paper's: which of LQR and pole placement is better at 12 V, and at what price?"""
+
+import dataclasses
+import importlib.resources
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from cpjax import io, paper
+from cpjax.controllers import Hybrid
+from cpjax.plant import CartPole
+from cpjax.sim.metrics import Metrics, ProtocolMetrics
+from cpjax.sim.sweep import sweep
+from cpjax.starts import sample_starts
+from cpjax.state import State
+from cpjax.study.reproduction import DESIGNS, GAINS, Setting
+from cpjax.study.summary import summarise
+
+Report = Callable[[int, int, str], None]
+PRESETS: Mapping[paper.Design, str] = {"lqr": "tuned_lqr.json", "placement": "tuned_place.json"}
+"""The tuned controllers that come with the package."""
+
+LAWS = ("as-printed", "corrected")
+"""The paper's two readings, from `cpjax.paper.LAWS`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """A controller in a comparison."""
+
+    name: str
+    """Such as "paper, as printed"."""
+    design: paper.Design
+    gains: str
+    """printed, computed or tuned."""
+    controller: Hybrid
+
+
+@dataclasses.dataclass(frozen=True)
+class Compared:
+    """An entry, and what it does at every start."""
+
+    entry: Entry
+    metrics: Metrics
+    """Of (n,) arrays."""
+    summary: Mapping[str, Any]
+    """See `summarise`."""
+
+
+def preset(design: paper.Design) -> Hybrid:
+    """The tuned controller that comes with the package, for the appendix's plant."""
+    with importlib.resources.as_file(importlib.resources.files("cpjax") / "presets" / PRESETS[design]) as path:
+        loaded: Hybrid = io.load(path)
+    return loaded
+
+
+def entries(plant: CartPole, tuned: Mapping[str, Hybrid] | None = None) -> list[Entry]:
+    """The paper's controllers for `plant`, both laws and both gains; and tuned ones.
+
+    Args:
+      tuned: by a name that begins with its design, such as "lqr"; by default the two that come with the package.
+    """
+    found = [
+        Entry(f"paper, {law.replace('-', ' ')}", design, gains, paper.controller(law, design, plant, gains))
+        for law in LAWS
+        for design in DESIGNS
+        for gains in GAINS
+    ]
+    chosen = {design: preset(design) for design in DESIGNS} if tuned is None else tuned
+    for name, controller in chosen.items():
+        design: paper.Design = "lqr" if _is_lqr(controller) else "placement"
+        found.append(Entry("tuned" if tuned is None else name, design, "tuned", controller))
+    return found
+
+
+def _is_lqr(controller: Any) -> bool:
+    design = getattr(getattr(controller, "regulator", None), "design", None)
+    return hasattr(design, "Q")
+
+
+def compare(
+    plant: CartPole,
+    chosen: Sequence[Entry],
+    setting: Setting,
+    *,
+    track_limit: float = float("inf"),
+    progress: Report | None = None,
+) -> tuple[State, list[Compared]]:
+    """Every entry over the same starts, as the protocol's evaluation runs; and the starts."""
+    starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
+    results = []
+    for i, entry in enumerate(chosen):
+        if progress is not None:
+            progress(i, len(chosen), f"{entry.name}, {entry.design}, {entry.gains}")
+        metrics: Metrics = sweep(
+            plant,
+            entry.controller,
+            starts,
+            duration=setting.duration,
+            dt=setting.dt,
+            clock="sampled",
+            metrics=ProtocolMetrics(track_limit=track_limit),
+        )
+        results.append(Compared(entry, metrics, summarise(metrics)))
+    if progress is not None:
+        progress(len(chosen), len(chosen), "done")
+    return starts, results
+
+
+def document(plant: CartPole, results: Sequence[Compared], setting: Setting, **others: Any) -> dict[str, Any]:
+    """The comparison for programs."""
+    rows = [
+        {
+            "name": one.entry.name,
+            "design": one.entry.design,
+            "gains": one.entry.gains,
+            "controller": io.encode(one.entry.controller),
+            **one.summary,
+        }
+        for one in results
+    ]
+    return {
+        "versions": io.versions(),
+        "setting": dataclasses.asdict(setting),
+        "plant": io.encode(plant),
+        "rows": rows,
+        **others,
+    }
+
+
+def best(results: Sequence[Compared], design: paper.Design, *, tuned: bool) -> Compared:
+    """The controller of a design with the most successes, and of those the fastest."""
+    pool = [one for one in results if one.entry.design == design and (one.entry.gains == "tuned") == tuned]
+
+    def rank(one: Compared) -> tuple[float, float]:
+        settling = float(one.summary["over_successes"]["settling_time"]["mean"])
+        return -float(one.summary["success_rate"]), settling if np.isfinite(settling) else np.inf
+
+    return min(pool, key=rank)

@@ -1,0 +1,78 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cpjax
+from cpjax import paper
+from cpjax.errors import InputError
+from cpjax.tune.objective import (
+    Effort,
+    Goal,
+    Jerkiness,
+    TerminalCost,
+    TrackExcess,
+    WeightedSum,
+    soft_maximum,
+    success_weighted,
+    tail_mean,
+)
+from cpjax.tune.starting import beginning
+
+PLANT = paper.appendix_plant()
+LAW = beginning("bland", "lqr", PLANT)
+START = cpjax.State(0.05, 0.0, 3.0, 0.1)
+RUN = {"duration": 3.0, "dt": 0.005}
+
+
+def test_terms_are_the_integrals_they_say():
+    fold = WeightedSum((Effort(), Jerkiness(1e-9), TrackExcess(0.3, 0.1), TerminalCost()), (1.0, 0.0, 0.0, 0.0))
+    kept = cpjax.rollout(PLANT, LAW, START, clock="sampled", metrics=fold, **RUN)
+    protocol = cpjax.measure(PLANT, LAW, START, clock="sampled", **RUN)
+    assert float(kept.metrics) == pytest.approx(float(protocol.effort), rel=1e-12)
+    jerk = cpjax.measure(PLANT, LAW, START, clock="sampled", metrics=Jerkiness(1e-9), **RUN)
+    assert float(jerk) == pytest.approx(float(protocol.voltage_variation), rel=1e-6)
+    excess = cpjax.measure(PLANT, LAW, START, clock="sampled", metrics=TrackExcess(0.3, 0.1), **RUN)
+    over = np.maximum(np.abs(np.asarray(kept.state.x)) - 0.2, 0.0) / 0.1
+    rate = 1.0 - np.exp(-0.5 * over * over)
+    assert float(excess) == pytest.approx(np.sum(0.5 * 0.005 * (rate[1:] + rate[:-1])), rel=1e-9)
+
+
+def test_every_terms_gradient_is_its_difference():
+    goal = Goal(effort=0.01, track=1.0, track_limit=0.5, jerkiness=0.01, energy=0.5, terminal=1.0)
+
+    def value(gain):
+        law = cpjax.Hybrid(cpjax.EnergySwingUp(PLANT, energy_gain=gain, cart_stiffness=2.0), LAW.regulator, LAW.gate)
+        return cpjax.measure(
+            PLANT, law, START, duration=1.5, dt=0.005, switching="located", metrics=goal.fold(PLANT, 0.3)
+        )
+
+    at = jnp.asarray(3.0)
+    differences = [float(value(at + h) - value(at - h)) / (2 * h) for h in (1e-4, 5e-5)]
+    richardson = (4 * differences[1] - differences[0]) / 3
+    assert float(jax.grad(value)(at)) == pytest.approx(richardson, rel=1e-5)
+
+
+def test_aggregates():
+    values = jnp.asarray([1.0, 2.0, 3.0, 10.0])
+    assert float(tail_mean(0.5)(values)) == 6.5
+    assert float(tail_mean(1.0)(values)) == 4.0
+    np.testing.assert_allclose(jax.grad(tail_mean(0.25))(values), [0.0, 0.0, 0.0, 1.0])
+    assert float(soft_maximum(1e-3)(values)) == pytest.approx(10.0, abs=2e-3)
+    assert float(soft_maximum(1e4)(values)) == pytest.approx(4.0, abs=2e-3)
+    assert float(success_weighted(5.0, 0.1)(values)) == pytest.approx(2.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: tail_mean(0.0), lambda: soft_maximum(-1.0), lambda: success_weighted(1.0, 0.0)]
+)
+def test_bad_aggregates_are_refused(make):
+    with pytest.raises(InputError):
+        make()
+
+
+def test_a_track_weight_needs_a_limit_and_a_goal_a_weight():
+    with pytest.raises(InputError, match="track"):
+        Goal(track=1.0)
+    with pytest.raises(InputError, match="weight"):
+        Goal(time=0.0).fold(PLANT, 0.3)

@@ -1,0 +1,105 @@
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import cpjax
+from cpjax import paper
+from cpjax.controllers import AngleRateGate, EnergySwingUp, Hybrid, LqrWeights, LyapunovGate, StateFeedback
+from cpjax.errors import InputError
+from cpjax.tune.parameters import free_parameters
+from cpjax.tune.starting import beginning
+from cpjax.tune.tuner import fastest_pole_bound
+
+PLANT = paper.appendix_plant()
+DESIGNS = ("lqr", "placement")
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+@pytest.mark.parametrize("full_q", [False, True])
+def test_the_starting_vector_makes_the_controller_again(design, full_q):
+    begun = beginning("bland", design, PLANT)
+    free = free_parameters(begun, full_q=full_q)
+    made = free.build(free.start())
+    np.testing.assert_allclose(made.regulator.K, begun.regulator.K, rtol=1e-9)
+    assert float(made.gate.half_angle) == pytest.approx(0.5, rel=1e-12)
+    assert float(made.swing_up.energy_gain) == pytest.approx(3.0, rel=1e-12)
+    assert len(free.labels) == free.physical(free.start()).shape[0] == free.start().shape[0]
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+def test_any_vector_makes_a_stable_regulator_and_a_gate_within_its_range(design):
+    free = free_parameters(beginning("bland", design, PLANT))
+    A, B = cpjax.linearize(PLANT)
+    for vector in free.draw(np.random.default_rng(0), 20):
+        made = free.build(jnp.asarray(vector))
+        assert np.all(np.linalg.eigvals(np.asarray(A - B @ made.regulator.K)).real < 0.0)
+        assert 0.0 < float(made.gate.half_angle) < math.pi
+
+
+@pytest.mark.parametrize("design", DESIGNS)
+def test_gradients_pass_through_the_design(design):
+    free = free_parameters(beginning("bland", design, PLANT))
+
+    def gain(vector):
+        return jnp.sum(free.build(vector).regulator.K)
+
+    start, step = free.start(), 1e-5
+    slope = jax.grad(gain)(start)
+    for i in range(start.shape[0]):
+        move = jnp.zeros_like(start).at[i].set(step)
+        difference = (gain(start + move) - gain(start - move)) / (2 * step)
+        assert float(slope[i]) == pytest.approx(float(difference), rel=1e-6, abs=1e-6)
+    np.testing.assert_allclose(slope, jax.jacfwd(gain)(start), rtol=1e-9, atol=1e-9)
+
+
+def test_a_lyapunov_gate_has_the_designs_own_form():
+    begun = beginning("bland", "lqr", PLANT)
+    found = begun.regulator.design.solve(*cpjax.linearize(PLANT))
+    gated = Hybrid(begun.swing_up, begun.regulator, LyapunovGate(found.P, 50.0))
+    free = free_parameters(gated)
+    made = free.build(free.start() + 0.3)
+    np.testing.assert_allclose(made.gate.P, made.regulator.design.solve(*cpjax.linearize(PLANT)).P, rtol=1e-9)
+
+
+def test_zeros_start_small_and_frozen_names_stay():
+    free = free_parameters(beginning("paper", "lqr", PLANT), frozen=["energy_gain"])
+    made = free.build(free.start())
+    assert 0.0 < float(made.swing_up.cart_stiffness) < 0.1
+    assert float(made.swing_up.energy_gain) == paper.ENERGY_GAIN
+    assert "energy_gain" not in free.labels
+
+
+@pytest.mark.parametrize(
+    ("arguments", "field"),
+    [({"free": ["nonsense"]}, "free"), ({"frozen": ["a"]}, "frozen"), ({"free": ["Q"], "frozen": ["Q"]}, "free")],
+)
+def test_a_wrong_name_is_named(arguments, field):
+    with pytest.raises(InputError) as caught:
+        free_parameters(beginning("bland", "lqr", PLANT), **arguments)
+    assert caught.value.field == field
+
+
+def test_a_regulator_without_its_design_is_refused():
+    law = EnergySwingUp(PLANT, energy_gain=3.0)
+    with pytest.raises(InputError, match="design"):
+        free_parameters(Hybrid(law, StateFeedback([1.0, 1.0, 1.0, 1.0]), AngleRateGate(0.5, 6.0)))
+
+
+def test_a_design_is_saved_beside_its_gain(tmp_path):
+    regulator = beginning("bland", "lqr", PLANT).regulator
+    cpjax.save(tmp_path / "law.json", regulator)
+    loaded = cpjax.load(tmp_path / "law.json")
+    assert isinstance(loaded.design, LqrWeights)
+    np.testing.assert_array_equal(loaded.design.Q, regulator.design.Q)
+
+
+def test_the_pole_bound_is_a_bound_and_no_worse_than_twice_the_pole():
+    random = np.random.default_rng(3)
+    for _ in range(50):
+        A = random.standard_normal((4, 4)) * 10.0 ** random.uniform(-1, 2)
+        fastest = np.max(np.abs(np.linalg.eigvals(A)))
+        bound = float(fastest_pole_bound(jnp.asarray(A)))
+        assert fastest * (1 - 1e-9) <= bound <= 2.0 * fastest * 6.0  # |c_k| is a sum of up to 6 products of k poles

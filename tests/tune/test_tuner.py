@@ -1,0 +1,86 @@
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cpjax import paper
+from cpjax.errors import InputError
+from cpjax.tune.parameters import free_parameters
+from cpjax.tune.plan import Plan
+from cpjax.tune.plants import UNCERTAIN, sample_plants
+from cpjax.tune.starting import beginning
+from cpjax.tune.tuner import _restore, _store, _Tuner, tune
+
+PLANT = paper.appendix_plant()
+SMALL = Plan(
+    candidates=6, screening=2, restarts=4, batch=2, steps=4, validate_every=2, validation=4, final=4,
+    duration=2.0, horizon=3.0, final_horizon=3.0, final_dt=0.005,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def tuner():
+    return _Tuner(PLANT, free_parameters(beginning("bland", "placement", PLANT)), SMALL)
+
+
+def test_stopped_at_any_checkpoint_it_ends_in_the_same_bits(tuner, tmp_path):
+    """Each memory goes through a file before the next step, and must change nothing."""
+    whole = stopped = tuner.begin()
+    while whole.step < SMALL.steps:
+        path = tmp_path / f"{whole.step}.npz"
+        _store(path, tuner, stopped)
+        stopped = tuner.advance(_restore(path, tuner))
+        whole = tuner.advance(whole)
+    np.testing.assert_array_equal(whole.vectors, stopped.vectors)
+    np.testing.assert_array_equal(whole.best, stopped.best)
+    assert json.dumps(whole.history) == json.dumps(stopped.history)  # NaN is NaN there
+    a, b = tuner.finish(whole, 0.0), tuner.finish(stopped, 0.0)
+    np.testing.assert_array_equal(a.vector, b.vector)
+    assert a.score == b.score
+    assert np.all(np.isfinite(a.vector))
+
+
+def test_a_checkpoint_of_another_tuning_is_refused(tuner, tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    _store(path, tuner, tuner.begin())
+    other = dataclasses.replace(SMALL, seed=2)
+    with pytest.raises(InputError, match="same tuning"):
+        tune(PLANT, tuner.free, other, checkpoint=path)
+    path.write_bytes(b"not a checkpoint")
+    with pytest.raises(InputError, match="checkpoint"):
+        tune(PLANT, tuner.free, SMALL, checkpoint=path)
+
+
+def test_a_start_that_cannot_be_simulated_does_no_harm(tuner):
+    starts, _ = tuner._draw(2, 1, 0)
+    bad = dataclasses.replace(starts, theta_dot=jnp.asarray([0.1, jnp.nan]))
+    vectors = jnp.asarray(tuner.begin().vectors)
+    loss, slope = tuner.gradient(vectors, bad, None, jnp.asarray(0.2))
+    assert np.all(np.isfinite(slope))
+    assert np.all(np.isfinite(loss))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("starts", "nowhere"), ("batch", 0), ("learning_rate", -1.0), ("dt", 0.3), ("plant_spread", 1.0), ("steps", 1.5)],
+)
+def test_a_bad_plan_is_refused(field, value):
+    with pytest.raises(InputError):
+        Plan(**{field: value})
+
+
+def test_plants_are_drawn_within_their_spread():
+    plants = sample_plants(PLANT, 200, spread=0.2, seed=1)
+    for name in UNCERTAIN:
+        part = PLANT.motor if hasattr(PLANT.motor, name) else PLANT
+        drawn = getattr(plants.motor if part is PLANT.motor else plants, name)
+        nominal = float(getattr(part, name))
+        assert drawn.shape == (200,)
+        assert np.all(np.abs(drawn - nominal) <= 0.2 * nominal + 1e-12)
+    one = sample_plants(PLANT, 5, spread=0.2, seed=1, only="pole_mass")
+    assert np.all(one.cart_mass == 1.0)
+    assert np.std(one.pole_mass) > 0.0
+    with pytest.raises(InputError):
+        sample_plants(PLANT, 5, spread=0.2, seed=1, only="gravity")
