@@ -6,6 +6,7 @@ Each minimises the mean settling time of 192 starts (5 s, a control held over 4 
 evaluations, from the bland start, for both designs. CMA-ES comes from the package cma (the extra "baselines").
 """
 
+import itertools
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -17,11 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from _common import run
 from scipy.optimize import minimize
-from tune_seeds import judge
+from tune_seeds import EVALUATION_SEED
 
 from cpjax import io, paper
 from cpjax.sim.rollout import measure
+from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
+from cpjax.study.summary import summarise
 from cpjax.tune.parameters import FreeParameters, free_parameters
 from cpjax.tune.starting import beginning
 
@@ -33,30 +36,29 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     """Prints a line for each search and writes tune_baselines.json."""
     rows = []
     evaluations = 14 if quick else EVALUATIONS
-    for design in get_args(paper.Design)[: 1 if quick else None]:
-        plant = paper.appendix_plant()
+    designs = get_args(paper.Design)[: 1 if quick else None]
+    unseen = sample_starts("hanging", 64 if quick else 10_000, seed=EVALUATION_SEED)
+    plant = paper.appendix_plant()
+    for method, design, number in itertools.product(_SEARCHES, designs, range(seed, seed + (1 if quick else 5))):
         free = free_parameters(beginning("bland", design, plant))
-        for method in ("random", "nelder-mead", "cma-es"):
-            for number in range(seed, seed + (1 if quick else 5)):
-                began = time.perf_counter()
-                score = _score(free, number, 4 if quick else STARTS)
-                found = _SEARCHES[method](score, free, number, evaluations)
-                if found is None:
-                    print(f"{method} needs the package cma: left out")
-                    break
-                seconds = time.perf_counter() - began
-                judged = judge(plant, free.build(jnp.asarray(found)), 64 if quick else 10_000)
-                cost = evaluations * STARTS * round(HORIZON / DT)
-                row = {"design": design, "method": method, "seed": number, "steps": cost, "seconds": seconds, **judged}
-                rows.append(row)
-                good = row["evaluation"]
-                print(
-                    f"{design:9} {method:11} {number}  {100 * good['success_rate']:7.3f} %  "
-                    f"{good['over_successes']['settling_time']['mean']:.3f} s  "
-                    f"{cost / 1e6:.0f} M steps  {seconds:.0f} s",
-                    flush=True,
-                )
-                io.write_json(out / "tune_baselines.json", {"versions": io.versions(), "rows": rows})
+        began = time.perf_counter()
+        found = _SEARCHES[method](_score(free, number, 4 if quick else STARTS), free, number, evaluations)
+        if found is None:
+            print(f"{method} needs the package cma: left out")
+            continue
+        seconds = time.perf_counter() - began
+        law = free.build(jnp.asarray(found))
+        judged = summarise(sweep(plant, law, unseen, duration=20.0, dt=0.002, clock="sampled"))
+        cost = evaluations * STARTS * round(HORIZON / DT)
+        names = {"design": design, "method": method, "seed": number, "steps": cost, "seconds": seconds}
+        rows.append({**names, "parameters": free.physical(jnp.asarray(found)), "evaluation": judged})
+        print(
+            f"{design:9} {method:11} {number}  {100 * judged['success_rate']:7.3f} %  "
+            f"{judged['over_successes']['settling_time']['mean']:.3f} s  "
+            f"{cost / 1e6:.0f} M steps  {seconds:.0f} s",
+            flush=True,
+        )
+        io.write_json(out / "tune_baselines.json", {"versions": io.versions(), "rows": rows})
     return rows
 
 
@@ -116,7 +118,7 @@ def _cma_es(score: Score, free: FreeParameters, seed: int, evaluations: int) -> 
     return best
 
 
-_SEARCHES: dict[str, Callable[..., Any]] = {"random": _random, "nelder-mead": _nelder_mead, "cma-es": _cma_es}
+_SEARCHES: dict[str, Callable[..., Any]] = {"cma-es": _cma_es, "random": _random, "nelder-mead": _nelder_mead}
 
 if __name__ == "__main__":
     os.environ.setdefault(

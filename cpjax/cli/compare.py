@@ -1,12 +1,13 @@
 """`cpjax compare`: the paper's gains against tuned ones, as a table, pictures and JSON."""
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cpjax import io
+from cpjax import io, paper
 from cpjax.cli.options import EVALUATION_OPTIONS, PLANT_OPTIONS, Option, add_options, build_plant, resolve
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
@@ -45,7 +46,7 @@ def run(given: argparse.Namespace) -> int:
     setting = Setting(seed=given.seed, **sections["evaluation"])
     files = dict(sections["tuned"])
     limit = files.pop("track_limit", float("inf"))
-    tuned = {design: _loaded(design, path) for design, path in files.items()}
+    tuned = {design: _loaded(design, files[design]) for design in DESIGNS if design in files}
     results = compared(given.out, plant, setting, tuned, limit)
 
     from cpjax.show.comparison import findings
@@ -57,17 +58,16 @@ def run(given: argparse.Namespace) -> int:
 
 
 def compared(
-    out: Path, plant: CartPole, setting: Setting, tuned: dict[str, Hybrid], track_limit: float = float("inf")
+    out: Path,
+    plant: CartPole,
+    setting: Setting,
+    tuned: Mapping[paper.Design, Hybrid],
+    track_limit: float = float("inf"),
 ) -> list[Compared]:
     """The comparison, with its JSON and pictures written; `tuned` by design, what is missing from the presets."""
-    from cpjax.study.comparison import preset
-
-    chosen = {design: tuned.get(design) or preset(design) for design in DESIGNS}
+    chosen = entries(plant, tuned)
     with progress("compare") as report:
-        starts, results = compare(
-            plant, entries(plant, {f"tuned, {name}": c for name, c in chosen.items()}), setting,
-            track_limit=track_limit, progress=report,
-        )  # fmt: skip
+        starts, results = compare(plant, chosen, setting, track_limit=track_limit, progress=report)
     io.write_json(out / "compare.json", document(plant, results, setting, track_limit=track_limit))
 
     from cpjax.show.comparison import by_start, responses

@@ -4,12 +4,14 @@ import argparse
 from typing import TYPE_CHECKING, Any, get_args
 
 from cpjax import __version__, io, paper
+from cpjax.cli.compare import compared
 from cpjax.cli.options import EVALUATION_OPTIONS, add_options
 from cpjax.cli.progress import progress
 from cpjax.cli.reproduce import print_rows, rows_of, setting_of
 from cpjax.controllers import AngleGate
 from cpjax.study.design_check import check_design, document
 from cpjax.study.forensics import audit_gains, printed_in_the_paper, write
+from cpjax.study.reproduction import Setting
 
 if TYPE_CHECKING:  # matplotlib takes a while; bad input should not wait for it
     from cpjax.show.page import Page
@@ -61,6 +63,7 @@ def run(given: argparse.Namespace) -> int:
         page.picture(png(figure), caption)
     _designs(page, given)
     _forensics(page, given)
+    _comparison(page, given, setting)
     page.section("How to get this page again")
     page.text(
         f"`cpjax report --starts {setting.starts} --count {setting.count} --seed {setting.seed} "
@@ -130,6 +133,32 @@ def _forensics(page: "Page", given: argparse.Namespace) -> None:
     page.note("Every fit stands in `audit_gains.json`; `cpjax audit-gains` does the same for any printed gain.")
     known = [direction_cells(d) for d in audit.directions if d.sensitivity > 0.0]
     page.table(DIRECTION_HEADER, known, text_columns=1)
+
+
+def _comparison(page: "Page", given: argparse.Namespace, setting: Setting) -> None:
+    """The paper's controllers beside the tuned ones."""
+    results = compared(given.out, paper.appendix_plant(), setting, {})
+
+    from cpjax.show.comparison import HEADER, cells, findings
+
+    page.section("Against tuned gains")
+    page.text(
+        "Energy gain, cart terms, gate and Q or poles, tuned together by gradients through whole swing-ups (`cpjax "
+        "tune`), from the same starts as above, of which the tuning has seen none. Which of the two methods is better "
+        "at 12 V?"
+    )
+    for sentence in findings(results):
+        page.text(sentence)
+    page.table(HEADER, [cells(one) for one in results], text_columns=3)
+    page.note("Means over the successful runs. Every number stands in `compare.json` beside this page.")
+    page.picture(
+        (given.out / "responses.png").read_bytes(),
+        "From one start: the best of the paper's controllers pumps for many swings; the tuned ones push and pull once.",
+    )
+    page.picture(
+        (given.out / "by_start.png").read_bytes(),
+        "Settling time by the angle and rate of the start, the paper's best above and tuned below; crosses fail.",
+    )
 
 
 def _shortest(seconds: float) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from cpjax.numeric.statistics import two_proportion_p_value
@@ -119,9 +120,9 @@ def by_start(starts: State, results: Sequence[Compared]) -> Figure:
             one, panel = best(results, design, tuned=tuned), axes[row, column]
             good = np.asarray(one.metrics.success)
             time = np.asarray(one.metrics.settling_time)
-            drawn = panel.scatter(theta[good], rate[good], c=time[good], s=5, cmap="viridis", vmin=1.5, vmax=10.0)
+            drawn = panel.scatter(theta[good], rate[good], c=time[good], s=5, cmap="viridis", norm=LogNorm(1.5, 15.0))
             panel.plot(theta[~good], rate[~good], "x", color="#D55E00", markersize=3, alpha=0.6)
-            panel.set_title(f"{one.entry.name}, {DESIGN_NAMES[design]}, {one.entry.gains} gains", fontsize="medium")
+            panel.set_title(f"{one.entry.name}: {DESIGN_NAMES[design]}, {one.entry.gains} gains", fontsize="medium")
         axes[1, column].set_xlabel(r"$\theta$ at the start [rad]")
     for row in range(2):
         axes[row, 0].set_ylabel(r"$\dot\theta$ at the start [rad/s]")

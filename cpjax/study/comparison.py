@@ -55,11 +55,11 @@ def preset(design: paper.Design) -> Hybrid:
     return loaded
 
 
-def entries(plant: CartPole, tuned: Mapping[str, Hybrid] | None = None) -> list[Entry]:
-    """The paper's controllers for `plant`, both laws and both gains; and tuned ones.
+def entries(plant: CartPole, tuned: Mapping[paper.Design, Hybrid] | None = None) -> list[Entry]:
+    """The paper's controllers for `plant`, both laws and both gains; and a tuned one of each design.
 
     Args:
-      tuned: by a name that begins with its design, such as "lqr"; by default the two that come with the package.
+      tuned: instead of the ones that come with the package.
     """
     found = [
         Entry(f"paper, {law.replace('-', ' ')}", design, gains, paper.controller(law, design, plant, gains))
@@ -67,16 +67,8 @@ def entries(plant: CartPole, tuned: Mapping[str, Hybrid] | None = None) -> list[
         for design in DESIGNS
         for gains in GAINS
     ]
-    chosen = {design: preset(design) for design in DESIGNS} if tuned is None else tuned
-    for name, controller in chosen.items():
-        design: paper.Design = "lqr" if _is_lqr(controller) else "placement"
-        found.append(Entry("tuned" if tuned is None else name, design, "tuned", controller))
-    return found
-
-
-def _is_lqr(controller: Any) -> bool:
-    design = getattr(getattr(controller, "regulator", None), "design", None)
-    return hasattr(design, "Q")
+    chosen = {design: (tuned or {}).get(design) or preset(design) for design in DESIGNS}
+    return found + [Entry("tuned", design, "tuned", controller) for design, controller in chosen.items()]
 
 
 def compare(
