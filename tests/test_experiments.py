@@ -10,7 +10,13 @@ FOLDER = Path(__file__).parent.parent / "experiments"
 EXPERIMENTS = sorted(path for path in FOLDER.glob("*.py") if not path.name.startswith("_"))
 
 
-@pytest.fixture(params=EXPERIMENTS, ids=lambda path: path.stem)
+SLOW = {"kill_and_resume"}  # starts four processes, each of which compiles
+
+
+@pytest.fixture(
+    params=[pytest.param(p, marks=[pytest.mark.slow] * (p.stem in SLOW)) for p in EXPERIMENTS],
+    ids=lambda path: path.stem,
+)
 def experiment(request, monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
     spec = importlib.util.spec_from_file_location(request.param.stem, request.param)
