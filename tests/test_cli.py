@@ -778,7 +778,7 @@ def report(tmp_path_factory):
 
 def test_a_report_writes_its_page_beside_the_rows_and_pictures(report):
     assert report.code == 0
-    data = {"reproduction.json", "designs.json", "audit_gains.json"}
+    data = {"reproduction.json", "designs.json", "audit_gains.json", "compare.json", "responses.png", "by_start.png"}
     assert {p.name for p in report.folder.iterdir()} == {"report.html", "audit_gains.png", *data, *FIGURES}
 
 
@@ -803,7 +803,7 @@ def test_a_report_is_one_valid_page_that_loads_nothing_from_elsewhere(report):
 
 def test_every_picture_of_a_report_is_inside_it_and_described(report):
     pictures = [attributes for tag, attributes in report.page.tags if tag == "img"]
-    assert len(pictures) == len(FIGURES) + 1
+    assert len(pictures) == len(FIGURES) + 3  # the audit's, and the comparison's two
     for picture in pictures:
         assert picture["src"].startswith("data:image/png;base64,iVBOR")
         assert len(picture["alt"]) > 20
@@ -854,6 +854,16 @@ def test_the_audit_in_a_report_is_that_of_its_json(report):
     assert explaining[0][2] == f"{fit['worst']:.3g}"
     assert explaining[0][3:5] == ["1.03846", "1.93006"]
     assert f"{len(audit['simplest'])} of 91" in "".join(report.page.words)
+
+
+def test_the_comparison_in_a_report_is_that_of_its_json(report):
+    rows = document(report.folder, "compare.json")["rows"]
+    tuned = [cells for cells in report.page.rows if cells and cells[0] == "tuned"]
+    expected = [row for row in rows if row["gains"] == "tuned"]
+    assert len(tuned) == len(expected) == 2
+    for cells, row in zip(tuned, expected, strict=True):
+        assert cells[3] == f"{100 * row['success_rate']:.2f}"
+        assert cells[5] == f"{row['over_successes']['settling_time']['mean']:.2f}"
 
 
 def test_a_report_names_its_setting_and_the_command_that_makes_it_again(report):
