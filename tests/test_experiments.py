@@ -10,7 +10,7 @@ FOLDER = Path(__file__).parent.parent / "experiments"
 EXPERIMENTS = sorted(path for path in FOLDER.glob("*.py") if not path.name.startswith("_"))
 
 
-SLOW = {"kill_and_resume"}  # starts four processes, each of which compiles
+SLOW = {"kill_and_resume", "tune_baselines", "tune_seeds"}  # mostly compile; tests/tune covers their parts
 
 
 @pytest.fixture(
