@@ -4,12 +4,14 @@ Everything here is for one start; batches are `jax.vmap` of it (`cpjax.sweep` do
 scan: that of `per_step.py`, or that of `located.py`.
 """
 
+import dataclasses
 import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.protocol import Controller, Law, SmoothController, as_controller
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
@@ -136,6 +138,16 @@ def _simulate(start: State, plant: CartPole, controller: Any, fold: Fold, dt: ja
     )
 
 
+def _without_designs(controller: Any) -> Any:
+    """A regulator's design is no part of its law: gains with one and gains without share a compilation."""
+
+    def bare(law: Any) -> Any:
+        designed = isinstance(law, StateFeedback) and law.design is not None
+        return dataclasses.replace(law, design=None) if designed else law
+
+    return jax.tree.map(bare, controller, is_leaf=lambda part: isinstance(part, StateFeedback))
+
+
 def _cast_arguments(
     plant: Any, controller: Any, fold: Fold | None, dt: float, dtype: Any, settings: Settings
 ) -> tuple[CartPole, Controller, Fold, jax.Array]:
@@ -144,7 +156,7 @@ def _cast_arguments(
     fold = ProtocolMetrics() if fold is None else fold
     if isinstance(fold, type) or not all(callable(getattr(fold, name, None)) for name in ("init", "update", "finish")):
         raise InputError("metrics", fold, "a fold, such as cpjax.ProtocolMetrics()")
-    controller = as_controller(controller)
+    controller = _without_designs(as_controller(controller))
     if settings.switching == "located" and not isinstance(controller, SmoothController):
         raise InputError("controller", controller, "one with margin and successor, for located switching")
     for name, part in (("plant", plant), ("controller", controller), ("metrics", fold)):
