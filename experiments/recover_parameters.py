@@ -20,8 +20,10 @@ from cpjax import io, paper
 from cpjax.plant import CartPole, Motor, linearize
 from cpjax.show.figures import save_figure
 from cpjax.show.forensics import DIRECTION_HEADER, FIT_HEADER, direction_cells, findings, fit_cells, picture, shown_fits
-from cpjax.study.forensics import PARAMETERS, GainAudit, PrintedGain, audit_gains, changed, document
-from cpjax.study.forensics import printed_in_the_paper as papers_prints
+from cpjax.study.forensics import GainAudit, audit_gains, document
+from cpjax.study.plant_fit import PARAMETERS, changed
+from cpjax.study.printed_gains import PrintedGain
+from cpjax.study.printed_gains import printed_in_the_paper as papers_prints
 
 IDENTIFIABLE = ("pole_length", "cart_friction", "torque_constant")
 """Three that the gains tell apart."""

@@ -27,7 +27,15 @@ from cpjax.tune.starting import beginning
 from cpjax.tune.tuner import document, tune
 
 EVALUATION_SEED = 20_000
-QUICK = {"candidates": 4, "restarts": 2, "steps": 2, "batch": 2, "screening": 2, "validation": 4, "final": 4}
+QUICK: dict[str, Any] = {
+    "candidates": 4,
+    "restarts": 2,
+    "steps": 2,
+    "batch": 2,
+    "screening": 2,
+    "validation": 4,
+    "final": 4,
+}
 
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
@@ -41,8 +49,8 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     rows = []
     for name, design, begin, number in cases[:1] if quick else cases:
         plant = paper.PLANTS[name]()
-        plan = Plan(seed=number, **(QUICK if quick else {}))  # type: ignore[arg-type]
-        free = free_parameters(beginning(begin, design, plant))  # type: ignore[arg-type]
+        plan = Plan(seed=number, **(QUICK if quick else {}))
+        free = free_parameters(beginning(begin, design, plant))
         case = f"{name}-{design}-{begin}-{number}"
         path = out / f"{case}.json"
         if not path.exists():

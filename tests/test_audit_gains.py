@@ -1,26 +1,17 @@
 """`cpjax audit-gains`, and the options of `cpjax swingup` that design a gain, called as functions."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import cpjax.show.figures
 from cpjax import AngleGate, LyapunovGate, io, linearize, lqr, paper, place
-from cpjax.cli import main
 from cpjax.cli.options import build_controller, parse_poles
 from cpjax.study import forensics
-from cpjax.study.forensics import (
-    PARAMETERS,
-    Direction,
-    Fit,
-    GainAudit,
-    PrintedGain,
-    audit_gains,
-    document,
-    printed_in_the_paper,
-)
+from cpjax.study.forensics import Direction, GainAudit, audit_gains, document
+from cpjax.study.plant_fit import PARAMETERS, Fit
+from cpjax.study.printed_gains import PrintedGain, printed_in_the_paper
 
 APPENDIX = paper.appendix_plant()
 PAIR = ("--parameters", "torque_constant,back_emf_constant", "--starts", "8")
@@ -29,18 +20,6 @@ WEIGHTS = ("--q", "200", "1", "1000", "1", "--r", "1e-4")
 PLACEMENT = ("--placement-gain", "-24.74", "-25.36", "111.70", "28.58")
 POLES = ("--poles", "-3", "-4", "-5", "-6")
 PNG = b"\x89PNG\r\n"
-
-
-@pytest.fixture
-def command(capsys):
-    """Runs a command; its exit code, standard output and standard error."""
-
-    def call(*arguments):
-        code = main([str(a) for a in arguments])
-        out, err = capsys.readouterr()
-        return SimpleNamespace(code=code, out=out, err=err)
-
-    return call
 
 
 @pytest.fixture
@@ -203,7 +182,7 @@ def test_a_bad_audit_is_one_line_on_standard_error(command, tmp_path, flags, wor
 
 def test_weights_for_which_the_plant_has_no_gain_are_one_line_on_standard_error(command, tmp_path, monkeypatch):
     nothing = np.array([0.0] * 4 + [np.nan] * 4), None  # compiling what finds this out takes long
-    monkeypatch.setattr(forensics, "_linearised", lambda prints, plant: nothing)
+    monkeypatch.setattr(forensics, "linearised", lambda prints, plant: nothing)
     blind = ("--q", "0", "1", "1000", "1", "--r", "1e-4")
     result = command("audit-gains", "--out", tmp_path / "out", *PAIR, *LQR, *blind, *PLACEMENT, *POLES)
     assert_refused(result, tmp_path, "lqr gain = (-1414.21, ", "a design for which the plant, before any change, has a")

@@ -46,18 +46,6 @@ PNG = b"\x89PNG\r\n"
 
 
 @pytest.fixture
-def command(capsys):
-    """Runs a command; its exit code, standard output and standard error."""
-
-    def call(*arguments):
-        code = main([str(a) for a in arguments])
-        out, err = capsys.readouterr()
-        return SimpleNamespace(code=code, out=out, err=err)
-
-    return call
-
-
-@pytest.fixture
 def no_pictures(monkeypatch):
     """Drawing is slow and is not what the test is about."""
     monkeypatch.setattr(cpjax.show.figures, "response", lambda *_: None)

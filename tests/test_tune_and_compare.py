@@ -2,13 +2,11 @@
 
 import json
 
-import jax
 import numpy as np
 import pytest
 
 import cpjax
 from cpjax import io, paper
-from cpjax.cli import main
 from cpjax.controllers import LqrWeights, PoleFactors
 from cpjax.study.comparison import DESIGNS, best, compare, entries, preset
 from cpjax.study.reproduction import Setting
@@ -17,16 +15,10 @@ PLANT = paper.appendix_plant()
 SMALL = ("--candidates", "3", "--restarts", "2", "--batch", "2", "--steps", "2", "--duration", "1")
 
 
-@pytest.fixture(autouse=True)
-def _settings():
-    """The command line turns on float64 itself; the tests' own settings come back."""
-    yield
-    jax.config.update("jax_enable_x64", True)
-
-
-def test_tune_writes_a_controller_that_other_commands_take(tmp_path, capsys):
-    assert main(["tune", "--out", str(tmp_path), *SMALL]) == 0
-    assert "settle" in capsys.readouterr().out
+def test_tune_writes_a_controller_that_other_commands_take(tmp_path, command):
+    done = command("tune", "--out", tmp_path, *SMALL)
+    assert done.code == 0
+    assert "settle" in done.out
     tuned = cpjax.load(tmp_path / "tuned.json")
     assert isinstance(tuned.regulator.design, LqrWeights)
     result = json.loads((tmp_path / "tune.json").read_text())
@@ -44,11 +36,11 @@ def test_tune_writes_a_controller_that_other_commands_take(tmp_path, capsys):
         (("--track", "1"), "track"),
     ],
 )
-def test_tune_names_what_is_wrong(arguments, words, tmp_path, capsys):
-    assert main(["tune", "--out", str(tmp_path), *arguments]) == 2
-    message = capsys.readouterr().err
-    assert words in message
-    assert message.count("\n") == 1
+def test_tune_names_what_is_wrong(arguments, words, tmp_path, command):
+    done = command("tune", "--out", tmp_path, *arguments)
+    assert done.code == 2
+    assert words in done.err
+    assert done.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("design", DESIGNS)
@@ -73,15 +65,16 @@ def test_a_comparison_has_the_papers_eight_and_two_tuned_and_ranks_the_tuned_fir
         assert tuned.summary["success_rate"] > papers.summary["success_rate"]
 
 
-def test_compare_writes_its_table_and_pictures(tmp_path, capsys):
-    arguments = ["--count", "4", "--duration", "4", "--dt", "0.004", "--out", str(tmp_path)]
-    assert main(["compare", *arguments]) == 0
-    assert "Tuned:" in capsys.readouterr().out
+def test_compare_writes_its_table_and_pictures(tmp_path, command):
+    done = command("compare", "--count", "4", "--duration", "4", "--dt", "0.004", "--out", tmp_path)
+    assert done.code == 0
+    assert "Tuned:" in done.out
     assert len(json.loads((tmp_path / "compare.json").read_text())["rows"]) == 10
     assert {path.name for path in tmp_path.iterdir()} == {"compare.json", "responses.png", "by_start.png"}
 
 
-def test_compare_refuses_a_file_without_a_hybrid(tmp_path, capsys):
+def test_compare_refuses_a_file_without_a_hybrid(tmp_path, command):
     cpjax.save(tmp_path / "plant.json", PLANT)
-    assert main(["compare", "--tuned-lqr", str(tmp_path / "plant.json"), "--out", str(tmp_path)]) == 2
-    assert "tuned-lqr" in capsys.readouterr().err
+    done = command("compare", "--tuned-lqr", tmp_path / "plant.json", "--out", tmp_path)
+    assert done.code == 2
+    assert "tuned-lqr" in done.err

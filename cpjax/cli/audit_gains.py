@@ -8,7 +8,9 @@ from cpjax.cli.options import PLANT_OPTIONS, Option, Sections, add_options, buil
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.errors import InputError
-from cpjax.study.forensics import PARAMETERS, GainAudit, PrintedGain, audit_gains, printed_in_the_paper, write
+from cpjax.study.forensics import GainAudit, audit_gains, write
+from cpjax.study.plant_fit import PARAMETERS
+from cpjax.study.printed_gains import PrintedGain, printed_in_the_paper
 
 OPTIONS = [
     *PLANT_OPTIONS,

@@ -3,23 +3,21 @@
 import argparse
 from typing import Any
 
-from cpjax import io, paper
+from cpjax import io
 from cpjax.cli.options import (
     CONTROLLER_OPTIONS,
     PLANT_OPTIONS,
     Option,
     add_options,
-    build_controller,
+    build_hybrid,
     build_plant,
-    parse_poles,
     resolve,
 )
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
-from cpjax.controllers import Hybrid
-from cpjax.errors import InputError
 from cpjax.starts import START_SETS, sample_starts
-from cpjax.study.gradient_audit import audit_gradients, document, parametrise
+from cpjax.study.gradient_audit import audit_gradients, document
+from cpjax.study.named_parameters import parametrise
 
 OPTIONS = [
     *PLANT_OPTIONS,
@@ -47,12 +45,10 @@ def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
-    controller = build_controller(sections["controller"], plant)
-    if not isinstance(controller, Hybrid):
-        raise InputError("controller", type(controller).__name__, "a Hybrid: a regulator behind a gate")
+    controller = build_hybrid(sections["controller"], plant)
     setting: dict[str, Any] = {"starts": "hanging", "count": 16, "duration": 4.0, "dt": 1e-3, **sections["audit"]}
     starts = sample_starts(setting["starts"], setting["count"], seed=given.seed)
-    chosen = parametrise(plant, controller, **_design(sections["controller"]))
+    chosen = parametrise(plant, controller)
     with progress("audit-gradients") as report:
         audit = audit_gradients(
             chosen.build,
@@ -81,14 +77,3 @@ def run(given: argparse.Namespace) -> int:
     print(*findings(audit), sep="\n")
     print(f"wrote {path} and {given.out / 'audit_gradients.png'}")
     return 0
-
-
-def _design(given: Any) -> dict[str, Any]:
-    """What the regulator's gain is designed from, if the options say so."""
-    if "K" in given or given.get("file") is not None:
-        return {}
-    if "poles" in given:
-        return {"poles": parse_poles(given["poles"])}
-    if "Q" in given or "R" in given:
-        return {"Q": given.get("Q", paper.Q), "R": given.get("R", paper.R)}
-    return {}

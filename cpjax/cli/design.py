@@ -4,10 +4,8 @@ import argparse
 from typing import Any
 
 from cpjax import io
-from cpjax.cli.options import CONTROLLER_OPTIONS, PLANT_OPTIONS, add_options, build_controller, build_plant, resolve
+from cpjax.cli.options import CONTROLLER_OPTIONS, PLANT_OPTIONS, add_options, build_hybrid, build_plant, resolve
 from cpjax.cli.tables import print_table
-from cpjax.controllers import Hybrid
-from cpjax.errors import InputError
 from cpjax.study.design_check import check_design, document
 
 OPTIONS = [*PLANT_OPTIONS, *CONTROLLER_OPTIONS]
@@ -28,9 +26,7 @@ def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
-    controller = build_controller(sections["controller"], plant)
-    if not isinstance(controller, Hybrid):
-        raise InputError("controller", type(controller).__name__, "a Hybrid: a regulator behind a gate")
+    controller = build_hybrid(sections["controller"], plant)
     regulator: Any = controller.regulator
     check = check_design(plant, regulator, controller.gate)
     path = given.out / "design.json"

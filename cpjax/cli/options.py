@@ -240,6 +240,14 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
     return Hybrid(swing_up, regulator, gate)
 
 
+def build_hybrid(given: Mapping[str, Any], plant: CartPole) -> Hybrid:
+    """As `build_controller`, for commands that need a regulator behind a gate."""
+    controller = build_controller(given, plant)
+    if not isinstance(controller, Hybrid):
+        raise InputError("controller", type(controller).__name__, "a Hybrid: a regulator behind a gate")
+    return controller
+
+
 def _build_regulator(changes: dict[str, Any], plant: CartPole, reference: State) -> StateFeedback:
     given = {key: changes.pop(key) for key in ("K", "design", "gains", "Q", "R", "poles") if key in changes}
     if changes.get("gate") == "lyapunov" and ("K" in given or "poles" in given):

@@ -10,7 +10,8 @@ from cpjax.cli.progress import progress
 from cpjax.cli.reproduce import print_rows, rows_of, setting_of
 from cpjax.controllers import AngleGate
 from cpjax.study.design_check import check_design, document
-from cpjax.study.forensics import audit_gains, printed_in_the_paper, write
+from cpjax.study.forensics import audit_gains, write
+from cpjax.study.printed_gains import printed_in_the_paper
 from cpjax.study.reproduction import Setting
 
 if TYPE_CHECKING:  # matplotlib takes a while; bad input should not wait for it

@@ -97,7 +97,7 @@ def run(given: argparse.Namespace) -> int:
 
 def _begin(name: str, design: paper.Design, plant: Any) -> Hybrid:
     if Path(name).suffix.lower() not in (".json", ".toml"):
-        return beginning(name, design, plant)  # type: ignore[arg-type]  # it checks the name
+        return beginning(name, design, plant)
     loaded = io.load(name)
     if not isinstance(loaded, Hybrid):
         raise InputError("start_from", name, "a file that holds a Hybrid")

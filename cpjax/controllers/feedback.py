@@ -62,9 +62,14 @@ class PoleFactors:
         """The four of them, to read (4,), complex [1/s]."""
         return self._factors().poles()
 
+    @property
+    def polynomial(self) -> jax.Array:
+        """The characteristic polynomial (4,), as `place_polynomial` takes it."""
+        return self._factors().polynomial()
+
     def solve(self, A: Array, B: Array) -> Designed:
         """By Ackermann's formula; P solves the closed loop's Lyapunov equation with the right side -I."""
-        K = place_polynomial(A, B, self._factors().polynomial())
+        K = place_polynomial(A, B, self.polynomial)
         A, B = jnp.asarray(A), jnp.asarray(B)
         return Designed(K, lyapunov(A - B @ K, jnp.eye(4, dtype=K.dtype)))
 

@@ -403,8 +403,8 @@ def _peak(loop: _Loop, scale: jax.Array, frequencies: jax.Array) -> _Margin:
 
     rounds = jnp.zeros((), dtype=jnp.int32)
     flat = _Ascent(jnp.full_like(scale, tolerance), jnp.full_like(scale, jnp.inf), rounds == 0, rounds)
-    # Where the search begins has no part in where it ends.
-    ascent = higher(flat, lax.stop_gradient(jnp.pad(frequencies, (1, 0))))._replace(rising=rounds == 0)
+    first = lax.stop_gradient(jnp.pad(frequencies, (1, 0)))  # where the search begins has no part in where it ends
+    ascent = higher(flat, first)._replace(rising=rounds == 0)
     ascent = lax.while_loop(lambda ascent: ascent.rising & (ascent.rounds < 30), rise, ascent)
 
     bounded = jnp.isfinite(ascent.frequency)

@@ -11,7 +11,8 @@ from matplotlib.ticker import MaxNLocator
 
 from cpjax.plant import CartPole, Motor
 from cpjax.pytree import Number, rules
-from cpjax.study.forensics import EXPLAINED, Direction, Fit, GainAudit, changed
+from cpjax.study.forensics import Direction, GainAudit
+from cpjax.study.plant_fit import EXPLAINED, Fit, changed
 
 FIT_HEADER = ("changed", "to", "worst residual", "force per volt [N/V]", "total damping [N s/m]", "starts that agree")
 DIRECTION_HEADER = ("combination of relative changes", "sensitivity", "known to")

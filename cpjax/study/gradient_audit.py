@@ -9,30 +9,26 @@ sensitivity that grows with time.
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from cpjax import io
-from cpjax.controllers import Hybrid, SmoothClip, SmoothHybrid, StateFeedback
-from cpjax.controllers.protocol import Controller, Law
-from cpjax.design.lqr import lqr
-from cpjax.design.placement import place_polynomial
+from cpjax.controllers import Hybrid, SmoothClip, SmoothHybrid
 from cpjax.errors import InputError
 from cpjax.numeric.differences import Differences, central_differences
-from cpjax.plant import CartPole, linearize
-from cpjax.pytree import Number, is_traced, part, pytree, rules
+from cpjax.plant import CartPole
+from cpjax.pytree import is_traced
 from cpjax.sim.flags import STOPPED, describe
-from cpjax.sim.metrics import GATE_CROSSING, Fold, Sample, TimeOutside
+from cpjax.sim.metrics import Fold, TimeOutside
 from cpjax.sim.rollout import measure
 from cpjax.sim.settings import check_settings
 from cpjax.state import NAMES, State, checked_start
+from cpjax.study.gradient_probe import Probe, Prober
+from cpjax.study.named_parameters import Build, Numbers, as_matrix, as_tree, whole_changes
 
-Numbers: TypeAlias = np.ndarray[Any, Any]
-Build: TypeAlias = Callable[[Mapping[str, jax.Array]], tuple[CartPole, Controller | Law]]
-"""Plant and controller of parameters. Traced."""
 Report: TypeAlias = Callable[[int, int, str], None]
 
 SLOW_CROSSING = 0.1
@@ -152,69 +148,6 @@ class GradientAudit:
         return found
 
 
-class _Probe(NamedTuple):
-    """At each horizon: the first axis."""
-
-    value: jax.Array
-    state: jax.Array
-    """(k, 4)."""
-    crossings: jax.Array
-    speed: jax.Array
-    path: jax.Array
-    """A number made of the sequence of crossings, of gate and supply, and of their steps: equal for equal sequences.
-    Where a crossing passes a sample, the samples' states, and what is summed of them, have a (small) kink."""
-
-
-class _Memory(NamedTuple):
-    objective: Any
-    crossings: jax.Array
-    speed: jax.Array
-    path: jax.Array
-    probe: _Probe
-
-
-@pytree
-class _Prober:
-    """The fold that keeps an objective and what led to it at several horizons."""
-
-    objective: Fold = part("a fold", "init", "update", "finish")
-    horizons: Any = None
-    """(k,) [s]."""
-    dt: Any = None
-    """[s]."""
-
-    def init(self, sample: Sample) -> _Memory:
-        k, dtype = self.horizons.shape[0], sample.time.dtype
-        none = jnp.zeros_like(sample.mode)
-        probe = _Probe(
-            jnp.zeros(k, dtype),
-            jnp.zeros((k, 4), dtype),
-            jnp.zeros(k, jnp.int32),
-            jnp.full(k, jnp.inf, dtype),
-            jnp.zeros(k, jnp.uint32),
-        )
-        far = jnp.full_like(sample.time, jnp.inf)
-        return _Memory(self.objective.init(sample), none, far, none.astype(jnp.uint32), probe)
-
-    def update(self, memory: _Memory, sample: Sample) -> _Memory:
-        objective = self.objective.update(memory.objective, sample)
-        at_gate = sample.crossing == GATE_CROSSING
-        crossings = memory.crossings + at_gate.astype(jnp.int32)
-        speed = jnp.where(at_gate, jnp.minimum(memory.speed, sample.crossing_speed), memory.speed)
-        step = jnp.floor(sample.time / self.dt).astype(jnp.uint32)
-        mixed = (memory.path + sample.crossing.astype(jnp.uint32)) * jnp.uint32(2654435761) + step
-        path = jnp.where(sample.crossing > 0, mixed, memory.path)
-        now = _Probe(self.objective.finish(objective, sample), sample.state.vector(), crossings, speed, path)
-        within = (sample.time <= self.horizons) & (sample.crossing == 0)  # horizons are grid points
-        probe = jax.tree.map(
-            lambda new, old: jnp.where(within.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), now, memory.probe
-        )
-        return _Memory(objective, crossings, speed, path, probe)
-
-    def finish(self, memory: _Memory, last: Sample) -> tuple[_Probe, jax.Array]:
-        return memory.probe, last.flag
-
-
 def audit_gradients(
     build: Build,
     parameters: Mapping[str, Any],
@@ -257,19 +190,19 @@ def audit_gradients(
         if isinstance(temperature, (bool, str)) or not 0.0 < temperature < math.inf:
             raise InputError("temperatures", temperature, "finite numbers above 0")
     n = int(jnp.shape(starts.x)[0])
-    names, x, shapes = _vector(parameters, n, each)
-    scale = _scales(names, x, scales or {})
-    fold = _Prober(
+    names, x, shapes = as_matrix(parameters, n, each)
+    scale = whole_changes(names, x, scales or {})
+    fold = Prober(
         TimeOutside() if objective is None else objective, jnp.asarray(ends + 0.25 * dt, dtype), jnp.asarray(dt, dtype)
     )
 
     def made(vector: jax.Array) -> tuple[CartPole, Hybrid]:
-        plant, controller = build(_tree(vector, shapes))
+        plant, controller = build(as_tree(vector, shapes))
         if not isinstance(controller, Hybrid):
             raise InputError("build", controller, "one that makes a cpjax.Hybrid")
         return plant, controller
 
-    def probe(vector: jax.Array, start: State, switching: Any, temperature: float | None) -> tuple[_Probe, jax.Array]:
+    def probe(vector: jax.Array, start: State, switching: Any, temperature: float | None) -> tuple[Probe, jax.Array]:
         plant, controller = made(vector)
         law: Any = controller
         if temperature is not None:
@@ -277,7 +210,7 @@ def audit_gradients(
             limit = plant.motor.voltage_limit
             if is_traced(limit) or np.isfinite(limit):
                 law = SmoothClip(law, limit, temperature * limit)
-        found: tuple[_Probe, jax.Array] = measure(
+        found: tuple[Probe, jax.Array] = measure(
             plant, law, start, duration=duration, dt=dt, switching=switching, metrics=fold
         )
         return found
@@ -333,7 +266,7 @@ def audit_gradients(
 
 
 def _differences(
-    probe: Callable[..., Any], x: Numbers, starts: State, scale: Numbers, found: _Probe, report: Callable[[str], None]
+    probe: Callable[..., Any], x: Numbers, starts: State, scale: Numbers, found: Probe, report: Callable[[str], None]
 ) -> Differences:
     """Of the rollout with located switching, in relative changes (n, k, d)."""
     n, d = x.shape
@@ -368,113 +301,6 @@ def _horizons(given: Sequence[float] | None, duration: float, dt: float) -> Numb
         pass
     allowed = f"rising times above 0 s, at most the duration, {duration:g} s, each a whole number of steps of {dt:g} s"
     raise InputError("horizons", given, allowed)
-
-
-def _vector(parameters: Mapping[str, Any], n: int, each: bool) -> tuple[tuple[str, ...], Numbers, Any]:
-    """Names of the elements, values (n, d), and what makes the mapping again."""
-    names: list[str] = []
-    columns, shapes = [], []
-    for name, value in parameters.items():
-        try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError) as problem:
-            raise InputError(f"parameters[{name}]", value, "a finite number or vector") from problem
-        array = array if each else np.broadcast_to(array, (n, *array.shape))
-        if array.ndim not in (1, 2) or array.shape[0] != n or not np.all(np.isfinite(array)):
-            raise InputError(f"parameters[{name}]", value, "a finite number or vector" + (", for each start" * each))
-        shapes.append((name, array.shape[1:]))
-        names += [name] if array.ndim == 1 else [f"{name}[{i}]" for i in range(array.shape[1])]
-        columns.append(array.reshape(n, -1))
-    if not columns:
-        raise InputError("parameters", parameters, "at least one")
-    return tuple(names), np.concatenate(columns, axis=1), tuple(shapes)
-
-
-def _tree(vector: jax.Array, shapes: Any) -> dict[str, jax.Array]:
-    tree, at = {}, 0
-    for name, shape in shapes:
-        size = math.prod(shape)
-        tree[name] = vector[at : at + size].reshape(shape)
-        at += size
-    return tree
-
-
-def _scales(names: tuple[str, ...], x: Numbers, given: Mapping[str, float]) -> Numbers:
-    scale = np.abs(x)
-    known = {name.split("[")[0] for name in names} | set(names)
-    for name, value in given.items():
-        if name not in known:
-            raise InputError(f"scales[{name}]", value, "the name of a parameter: " + ", ".join(sorted(known)))
-        if isinstance(value, (bool, str)) or not (math.isfinite(value) and value > 0):
-            raise InputError(f"scales[{name}]", value, "a finite number above 0")
-        chosen = [i for i, one in enumerate(names) if name in (one, one.split("[")[0])]
-        scale[:, chosen] = value
-    zero = [name for name, column in zip(names, scale.T, strict=True) if np.any(column == 0.0)]
-    if zero:
-        raise InputError(f"scales[{zero[0]}]", given.get(zero[0]), "given, where a parameter is zero")
-    return scale
-
-
-_PLANT = ("cart_mass", "pole_mass", "pole_length", "cart_friction", "pivot_friction")
-_SCALES = {"cart_friction": 0.1, "pivot_friction": 0.01, "hysteresis": 0.1}
-
-
-class Parametrisation(NamedTuple):
-    """What `audit_gradients` takes."""
-
-    build: Build
-    parameters: dict[str, Any]
-    scales: dict[str, float]
-
-
-def parametrise(
-    plant: CartPole, controller: Hybrid, *, Q: Any = None, R: Any = None, poles: Any = None
-) -> Parametrisation:
-    """The numbers of a closed loop by name: of the plant, the swing-up law, the regulator and the gate.
-
-    The regulator's are its gain K; or, if the gain is designed for the plant, the diagonal weights Q (4,) and R, or the
-    characteristic polynomial of the four poles. The law's model of the plant, and the linear model that a gain is
-    designed for, are the plant as given: they do not change with it.
-
-    Raises:
-      InputError: a controller that is not a Hybrid with a StateFeedback.
-    """
-    if not isinstance(controller, Hybrid) or not isinstance(controller.regulator, StateFeedback):
-        raise InputError("controller", controller, "a cpjax.Hybrid with a cpjax.StateFeedback")
-    law, gate, reference = controller.swing_up, controller.gate, controller.regulator.reference
-    parameters: dict[str, Any] = {name: float(getattr(plant, name)) for name in _PLANT}
-    if math.isfinite(float(plant.motor.voltage_limit)):
-        parameters["voltage_limit"] = float(plant.motor.voltage_limit)
-    of_law, of_gate = (
-        [name for name, rule in rules(type(part)).items() if isinstance(rule, Number) and not name.startswith("kick")]
-        for part in (law, gate)
-    )
-    of_law = [name for name in of_law if float(getattr(law, name)) != 0.0]
-    parameters |= {name: float(getattr(law, name)) for name in of_law}
-    parameters |= {name: float(getattr(gate, name)) for name in of_gate}
-    A, B = linearize(plant)
-    if (Q is None) != (R is None):
-        raise InputError("R" if R is None else "Q", None, "given: a design has both weights")
-    if Q is not None:
-        parameters |= {"Q": np.asarray(Q, dtype=np.float64), "R": float(R)}
-    elif poles is not None:
-        parameters["polynomial"] = np.real(np.poly(np.asarray(poles)))[1:]
-    else:
-        parameters["K"] = np.asarray(controller.regulator.K, dtype=np.float64)[0]
-
-    def build(p: Mapping[str, jax.Array]) -> tuple[CartPole, Hybrid]:
-        if "Q" in p:
-            K = lqr(A, B, jnp.diag(p["Q"]), p["R"]).K
-        else:
-            K = place_polynomial(A, B, p["polynomial"]) if "polynomial" in p else p["K"][None]
-        motor = dataclasses.replace(plant.motor, **{n: p[n] for n in ("voltage_limit",) if n in p})
-        changed = dataclasses.replace(plant, **{n: p[n] for n in _PLANT}, motor=motor)
-        swing_up: Any = dataclasses.replace(law, **{n: p[n] for n in of_law})  # type: ignore[type-var]  # a dataclass
-        region: Any = dataclasses.replace(gate, **{n: p[n] for n in of_gate})  # type: ignore[type-var]  # a dataclass
-        return changed, Hybrid(swing_up, StateFeedback(K, reference), region)
-
-    scales = {name: scale for name, scale in _SCALES.items() if parameters.get(name) == 0.0}
-    return Parametrisation(build, parameters, scales)
 
 
 def document(audit: GradientAudit, starts: State, **setting: Any) -> dict[str, Any]:

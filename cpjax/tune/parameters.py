@@ -55,6 +55,11 @@ class FreeParameters:
     slots: tuple[_Slot, ...]
 
     @property
+    def model(self) -> CartPole:
+        """The swing-up law's own idea of the plant, for which the regulator is designed."""
+        return _law(self.controller).model
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """A name for each element of a physical vector, such as "Q[0]"."""
         return tuple(
@@ -90,8 +95,9 @@ class FreeParameters:
                 value = jnp.diag(value)
             given[slot.part][slot.name] = value if slot.name in ("Q", "a", "b") else value[0]
         regulator: Any = self.controller.regulator
-        swing_up: Any = dataclasses.replace(self.controller.swing_up, **given["swing_up"])  # type: ignore[type-var]
-        gate: Any = dataclasses.replace(self.controller.gate, **given["gate"])  # type: ignore[type-var]
+        gate: Any = self.controller.gate  # a dataclass, which the protocol that annotates it does not say
+        swing_up = dataclasses.replace(_law(self.controller), **given["swing_up"])
+        gate = dataclasses.replace(gate, **given["gate"])
         if given["design"]:
             design = dataclasses.replace(regulator.design, **given["design"])
             found = design.solve(*linearize(swing_up.model))
@@ -132,7 +138,8 @@ class FreeParameters:
     def _top(self, name: str) -> float:
         """The upper end of a parameter between zero and something."""
         if name == "half_angle":  # the way out must not be wider than a half turn
-            return math.pi / (1.0 + float(self.controller.gate.hysteresis))  # type: ignore[attr-defined]
+            gate: Any = self.controller.gate  # one of those that have such an angle
+            return math.pi / (1.0 + float(gate.hysteresis))
         return math.pi / 2
 
 
@@ -189,15 +196,15 @@ class _Natural(NamedTuple):
     """sqrt(m g l / J): of the small oscillation about hanging [1/s]."""
     energy_gain: float
     """The full acceleration over energy and rate of a pendulum that has to be swung up [m/(J s)]."""
-    weights: tuple[float, float, float, float]
+    weights: tuple[float, ...]
     """Q / R that make the full voltage of one length, or of one radian."""
     level: float
     """What it costs to come back, in the unit of the design's s' P s."""
 
 
 def _natural(controller: Hybrid) -> _Natural:
-    law: Any = controller.swing_up
-    plant: CartPole = law.model
+    plant, regulator = _law(controller).model, controller.regulator
+    assert isinstance(regulator, StateFeedback)
     weight = float(plant.pole_mass) * float(plant.gravity) * float(plant.pole_length)
     rate = math.sqrt(weight / float(plant.pivot_inertia))
     limit = float(plant.motor.voltage_limit)
@@ -205,9 +212,9 @@ def _natural(controller: Hybrid) -> _Natural:
     push = abs(float(plant.motor.force_per_voltage)) * voltage / float(plant.moving_mass)
     length = float(plant.pole_length)
     per = (voltage / length, voltage / (length * rate), voltage, voltage / rate)
-    design = controller.regulator.design  # type: ignore[attr-defined]
+    design = regulator.design
     level = float(design.R) * voltage * voltage / rate if isinstance(design, LqrWeights) else 1.0 / rate
-    return _Natural(rate, push / (4.0 * weight * rate), tuple(v * v for v in per), level)  # type: ignore[arg-type]
+    return _Natural(rate, push / (4.0 * weight * rate), tuple(v * v for v in per), level)
 
 
 def _ranges(controller: Hybrid) -> Mapping[str, tuple[float, float]]:
@@ -231,10 +238,17 @@ def _ranges(controller: Hybrid) -> Mapping[str, tuple[float, float]]:
     }
 
 
+def _law(controller: Hybrid) -> EnergySwingUp:
+    law = controller.swing_up
+    assert isinstance(law, EnergySwingUp)  # `free_parameters` saw to it
+    return law
+
+
 def _weights(controller: Hybrid) -> LqrWeights:
-    regulator: Any = controller.regulator
-    weights: LqrWeights = regulator.design
-    return weights
+    regulator = controller.regulator
+    assert isinstance(regulator, StateFeedback)
+    assert isinstance(regulator.design, LqrWeights)
+    return regulator.design
 
 
 def _read(controller: Hybrid, slot: _Slot) -> Any:

@@ -13,7 +13,7 @@ from cpjax.plant import CartPole, linearize
 Beginning: TypeAlias = Literal["bland", "paper"]
 
 
-def beginning(name: Beginning, design: paper.Design, plant: CartPole) -> Hybrid:
+def beginning(name: str, design: paper.Design, plant: CartPole) -> Hybrid:
     """A controller with a design, an energy law and an `AngleRateGate`, for `plant`.
 
     bland: round numbers that nobody has tuned. paper: the values of the paper, k = 0.2 with its Q and R or its poles,

@@ -274,7 +274,7 @@ class _Tuner:
                 dt=plan.dt,
                 switching="located",
                 spare_steps=plan.spare_steps,
-                metrics=plan.goal.fold(self.free.controller.swing_up.model, width),  # type: ignore[attr-defined]
+                metrics=plan.goal.fold(self.free.model, width),
             )
             return value
 
@@ -303,9 +303,8 @@ class _Tuner:
 
     def _pole_bound(self, vector: Vector) -> jax.Array:
         """At least the magnitude of the fastest pole, at most twice that (Fujiwara, 1916) [1/s]."""
-        controller = self.free.build(vector)
-        A, B = linearize(controller.swing_up.model)  # type: ignore[attr-defined]  # an energy law
-        regulator = controller.regulator
+        A, B = linearize(self.free.model)
+        regulator = self.free.build(vector).regulator
         assert isinstance(regulator, StateFeedback)
         return fastest_pole_bound(A - B @ jnp.asarray(regulator.K))
 

@@ -18,19 +18,10 @@ from cpjax import CartPole, InputError, Motor, io, linearize, paper
 from cpjax.pytree import cast
 from cpjax.show.figures import png
 from cpjax.show.forensics import direction_cells, findings, fit_cells, picture, shown_fits
-from cpjax.study import forensics
-from cpjax.study.forensics import (
-    PARAMETERS,
-    Direction,
-    Fit,
-    GainAudit,
-    PrintedGain,
-    audit_gains,
-    changed,
-    document,
-    printed_in_the_paper,
-    write,
-)
+from cpjax.study import forensics, plant_fit
+from cpjax.study.forensics import Direction, GainAudit, audit_gains, document, write
+from cpjax.study.plant_fit import PARAMETERS, Fit, changed, least_squares
+from cpjax.study.printed_gains import PrintedGain, printed_in_the_paper
 
 APPENDIX = paper.appendix_plant()
 PAIR = ("torque_constant", "back_emf_constant")
@@ -336,7 +327,7 @@ def fake_ends(monkeypatch, residuals_of):
         sizes.append(len(starts))
         return np.exp(starts), np.array([residuals_of(next(lane)) for _ in starts])
 
-    monkeypatch.setattr(forensics, "_fitted", fitted)
+    monkeypatch.setattr(plant_fit, "_fitted", fitted)
     return sizes
 
 
@@ -365,7 +356,7 @@ def test_a_set_from_which_no_start_leads_anywhere_explains_nothing(monkeypatch):
 
 
 def test_more_fits_than_run_side_by_side_are_those_of_one_go(monkeypatch):
-    monkeypatch.setattr(forensics, "_LANES", 7)
+    monkeypatch.setattr(plant_fit, "_LANES", 7)
     sizes = fake_ends(monkeypatch, lambda lane: [float(lane + 1)] * 8)
     calls = []
     audit = audit_gains(
@@ -382,7 +373,7 @@ def test_the_least_squares_method_finds_the_end_of_rosenbrocks_valley_and_never_
         r = jnp.stack([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]])
         return r, jnp.stack([jnp.stack([-20.0 * x[0], 10.0 * jnp.ones_like(x[0])]), jnp.asarray([-1.0, 0.0])])
 
-    solve = jax.jit(jax.vmap(lambda x: forensics._least_squares(residuals, x, 2)))
+    solve = jax.jit(jax.vmap(lambda x: least_squares(residuals, x, 2)))
     ends, rest = solve(jnp.asarray([[-1.2, 1.0], [3.0, -2.0], [jnp.nan, 1.0]]))
     np.testing.assert_allclose(ends[:2], 1.0, atol=1e-7)
     np.testing.assert_allclose(rest[:2], 0.0, atol=1e-7)

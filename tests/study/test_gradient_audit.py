@@ -1,7 +1,6 @@
 import json
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,10 +9,10 @@ import pytest
 import cpjax
 import cpjax.cli.audit_gradients
 from cpjax import AngleGate, CartPole, EnergySwingUp, Hybrid, InputError, Motor, State, StateFeedback, paper
-from cpjax.cli import main
 from cpjax.show.gradients import cells, findings, header, picture
 from cpjax.sim.flags import Flag
-from cpjax.study.gradient_audit import GradientAudit, audit_gradients, document, parametrise
+from cpjax.study.gradient_audit import GradientAudit, audit_gradients, document
+from cpjax.study.named_parameters import parametrise
 
 PLANT = paper.appendix_plant()
 K = (-24.74, -25.36, 111.70, 28.58)
@@ -164,22 +163,22 @@ def test_arguments_that_mean_nothing_are_refused_by_name(changes, field):
 
 
 def test_a_loops_numbers_by_name_make_the_loop_again():
-    controller = paper.controller("corrected-centred", "placement", PLANT)
     state = State(0.1, 0.2, 0.4, -1.0)
-    for design in ({}, {"Q": paper.Q, "R": paper.R}, {"poles": paper.POLES}):
-        chosen = parametrise(PLANT, controller, **design)
+    for design, gains, name in (
+        ("placement", "printed", "K"),
+        ("lqr", "computed", "Q"),
+        ("placement", "computed", "polynomial"),
+    ):
+        controller = paper.controller("corrected-centred", design, PLANT, gains)
+        chosen = parametrise(PLANT, controller)
+        assert name in chosen.parameters
         plant, again = chosen.build({name: jnp.asarray(value) for name, value in chosen.parameters.items()})
-        expected = controller.regulator
-        if design:
-            expected = paper.regulator("lqr" if "Q" in design else "placement", "computed", PLANT)
-        np.testing.assert_allclose(again.regulator.K, expected.K, rtol=1e-9)
+        np.testing.assert_allclose(again.regulator.K, controller.regulator.K, rtol=1e-9)
         assert float(again.swing_up.voltage(state)) == pytest.approx(float(controller.swing_up.voltage(state)))
         assert float(plant.motor.voltage_limit) == 12.0
         assert set(chosen.scales) == {"cart_friction", "pivot_friction", "hysteresis"}
     with pytest.raises(InputError):
         parametrise(PLANT, controller.swing_up)
-    with pytest.raises(InputError, match="both weights"):
-        parametrise(PLANT, controller, Q=paper.Q)
 
 
 @pytest.mark.slow
@@ -190,16 +189,6 @@ def test_a_supply_without_limit_is_audited_too():
     found = audit_gradients(chosen.build, chosen.parameters, STARTS, scales=chosen.scales, **SHORT, temperatures=(0.1,))
     assert np.all(np.isfinite(found.smooth[0]))
     assert np.nanmax(np.where(found.resolved, found.errors(found.located), np.nan)[:, -1]) <= 1e-6
-
-
-@pytest.fixture
-def command(capsys):
-    def call(*arguments):
-        code = main([str(a) for a in arguments])
-        out, err = capsys.readouterr()
-        return SimpleNamespace(code=code, out=out, err=err)
-
-    return call
 
 
 ARGUMENTS = ("--count", "2", "--duration", "1.2", "--dt", "0.004", "--seed", "3")

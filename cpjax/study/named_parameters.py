@@ -1,0 +1,131 @@
+"""The numbers of a closed loop by name, as they are: of plant, swing-up law, regulator and gate."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cpjax.controllers import Hybrid, LqrWeights, PoleFactors, StateFeedback
+from cpjax.controllers.protocol import Controller, Law
+from cpjax.design.lqr import lqr
+from cpjax.design.placement import place_polynomial
+from cpjax.errors import InputError
+from cpjax.plant import CartPole, linearize
+from cpjax.pytree import Number, rules
+
+Numbers: TypeAlias = np.ndarray[Any, Any]
+Build: TypeAlias = Callable[[Mapping[str, jax.Array]], tuple[CartPole, Controller | Law]]
+"""Plant and controller of parameters. Traced."""
+
+_PLANT = ("cart_mass", "pole_mass", "pole_length", "cart_friction", "pivot_friction")
+_SCALES = {"cart_friction": 0.1, "pivot_friction": 0.01, "hysteresis": 0.1}
+
+
+class Parametrisation(NamedTuple):
+    """What `audit_gradients` takes."""
+
+    build: Build
+    parameters: dict[str, Any]
+    scales: dict[str, float]
+
+
+def parametrise(plant: CartPole, controller: Hybrid) -> Parametrisation:
+    """The numbers of a closed loop by name: of the plant, the swing-up law, the regulator and the gate.
+
+    The regulator's are those of its design, the diagonal weights Q (4,) and R, or the characteristic polynomial of the
+    four poles; or, without a design or with a full Q, its gain K. The law's model of the plant, for which a gain is
+    designed, does not change with the plant.
+
+    Raises:
+      InputError: a controller that is not a Hybrid with a StateFeedback.
+    """
+    if not isinstance(controller, Hybrid) or not isinstance(controller.regulator, StateFeedback):
+        raise InputError("controller", controller, "a cpjax.Hybrid with a cpjax.StateFeedback")
+    law, gate, reference = controller.swing_up, controller.gate, controller.regulator.reference
+    parameters: dict[str, Any] = {name: float(getattr(plant, name)) for name in _PLANT}
+    if math.isfinite(float(plant.motor.voltage_limit)):
+        parameters["voltage_limit"] = float(plant.motor.voltage_limit)
+    of_law, of_gate = (
+        [name for name, rule in rules(type(part)).items() if isinstance(rule, Number) and not name.startswith("kick")]
+        for part in (law, gate)
+    )
+    of_law = [name for name in of_law if float(getattr(law, name)) != 0.0]
+    parameters |= {name: float(getattr(law, name)) for name in of_law}
+    parameters |= {name: float(getattr(gate, name)) for name in of_gate}
+    A, B = linearize(getattr(law, "model", plant))
+    design = controller.regulator.design
+    if isinstance(design, LqrWeights) and np.array_equal(design.Q, np.diag(np.diagonal(design.Q))):
+        parameters |= {"Q": np.diagonal(np.asarray(design.Q, dtype=np.float64)), "R": float(design.R)}
+    elif isinstance(design, PoleFactors):
+        parameters["polynomial"] = np.asarray(design.polynomial, dtype=np.float64)
+    else:
+        parameters["K"] = np.asarray(controller.regulator.K, dtype=np.float64)[0]
+
+    def build(p: Mapping[str, jax.Array]) -> tuple[CartPole, Hybrid]:
+        if "Q" in p:
+            K = lqr(A, B, jnp.diag(p["Q"]), p["R"]).K
+        else:
+            K = place_polynomial(A, B, p["polynomial"]) if "polynomial" in p else p["K"][None]
+        motor = dataclasses.replace(plant.motor, **{n: p[n] for n in ("voltage_limit",) if n in p})
+        changed = dataclasses.replace(plant, **{n: p[n] for n in _PLANT}, motor=motor)
+        swing_up: Any = dataclasses.replace(law, **{n: p[n] for n in of_law})  # type: ignore[type-var]  # a dataclass
+        region: Any = dataclasses.replace(gate, **{n: p[n] for n in of_gate})  # type: ignore[type-var]  # a dataclass
+        return changed, Hybrid(swing_up, StateFeedback(K, reference), region)
+
+    scales = {name: scale for name, scale in _SCALES.items() if parameters.get(name) == 0.0}
+    return Parametrisation(build, parameters, scales)
+
+
+def as_matrix(parameters: Mapping[str, Any], n: int, each: bool) -> tuple[tuple[str, ...], Numbers, Any]:
+    """Names of the elements, values (n, d), and what makes the mapping again."""
+    names: list[str] = []
+    columns, shapes = [], []
+    for name, value in parameters.items():
+        try:
+            array = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError) as problem:
+            raise InputError(f"parameters[{name}]", value, "a finite number or vector") from problem
+        array = array if each else np.broadcast_to(array, (n, *array.shape))
+        if array.ndim not in (1, 2) or array.shape[0] != n or not np.all(np.isfinite(array)):
+            raise InputError(f"parameters[{name}]", value, "a finite number or vector" + (", for each start" * each))
+        shapes.append((name, array.shape[1:]))
+        names += [name] if array.ndim == 1 else [f"{name}[{i}]" for i in range(array.shape[1])]
+        columns.append(array.reshape(n, -1))
+    if not columns:
+        raise InputError("parameters", parameters, "at least one")
+    return tuple(names), np.concatenate(columns, axis=1), tuple(shapes)
+
+
+def as_tree(vector: jax.Array, shapes: Any) -> dict[str, jax.Array]:
+    """The mapping again, of one row (d,) and the shapes that `as_matrix` found."""
+    tree, at = {}, 0
+    for name, shape in shapes:
+        size = math.prod(shape)
+        tree[name] = vector[at : at + size].reshape(shape)
+        at += size
+    return tree
+
+
+def whole_changes(names: tuple[str, ...], x: Numbers, given: Mapping[str, float]) -> Numbers:
+    """What counts as a whole change of each element (n, d): what is given, or else its size.
+
+    Raises:
+      InputError: an unknown name, a change that is not above 0, or a parameter that is zero and has none.
+    """
+    scale = np.abs(x)
+    known = {name.split("[")[0] for name in names} | set(names)
+    for name, value in given.items():
+        if name not in known:
+            raise InputError(f"scales[{name}]", value, "the name of a parameter: " + ", ".join(sorted(known)))
+        if isinstance(value, (bool, str)) or not (math.isfinite(value) and value > 0):
+            raise InputError(f"scales[{name}]", value, "a finite number above 0")
+        chosen = [i for i, one in enumerate(names) if name in (one, one.split("[")[0])]
+        scale[:, chosen] = value
+    zero = [name for name, column in zip(names, scale.T, strict=True) if np.any(column == 0.0)]
+    if zero:
+        raise InputError(f"scales[{zero[0]}]", given.get(zero[0]), "given, where a parameter is zero")
+    return scale
