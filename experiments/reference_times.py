@@ -11,7 +11,6 @@ import math
 from pathlib import Path
 from typing import Any, get_args
 
-import jax
 import numpy as np
 from _common import run
 
@@ -25,14 +24,13 @@ from cpjax.state import NAMES, State
 from cpjax.study.comparison import preset
 
 INTERVALS, HOLD, HOLD_INTERVALS, BAND = 80, 1.0, 20, 0.05
-SEED = 40_000
 
 
-def main(out: Path, quick: bool = False, seed: int = SEED) -> dict[str, Any]:
+def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
     """Prints the ratios and writes reference_times.json."""
     plant = paper.appendix_plant()
     count = 1 if quick else 64
-    starts = sample_starts("hanging", count, seed=seed)
+    starts = sample_starts("hanging", count, seed=40_000 + seed)
     laws = {design: preset(design) for design in get_args(paper.Design)}
     times = {}
     for design, law in laws.items():
@@ -124,5 +122,4 @@ def _field(casadi: Any, plant: CartPole) -> Any:
 
 
 if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # untyped in JAX
     run(main, __doc__ or "")

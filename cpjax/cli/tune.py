@@ -18,7 +18,6 @@ from cpjax.tune.objective import Goal
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
 from cpjax.tune.starting import beginning
-from cpjax.tune.tuner import document, tune
 
 _DEFAULTS = {field.name: field.default for field in dataclasses.fields(Plan)}
 _PLANNED = {
@@ -66,6 +65,8 @@ def add_command(commands: Any) -> None:
 
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
+    from cpjax.tune.tuner import document, tune  # optax takes a while; other commands should not wait for it
+
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     setting = dict(sections["tune"])

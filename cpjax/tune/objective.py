@@ -175,13 +175,10 @@ Aggregate: TypeAlias = Callable[[jax.Array], jax.Array]
 """One number of the values of many starts (n,). Its derivative says how much each start's gradient counts."""
 
 
-def mean() -> Aggregate:
-    """The mean."""
-    return jnp.mean
-
-
 def tail_mean(share: float) -> Aggregate:
-    """The mean of the worst `share` of the starts: the conditional value at risk (Rockafellar and Uryasev, 2000)."""
+    """The mean of the worst `share` of the starts (1: of all): the conditional value at risk (Rockafellar and Uryasev,
+    2000).
+    """
     _check_share("share", share)
 
     def worst(values: jax.Array) -> jax.Array:

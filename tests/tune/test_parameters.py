@@ -96,10 +96,11 @@ def test_a_design_is_saved_beside_its_gain(tmp_path):
     np.testing.assert_array_equal(loaded.design.Q, regulator.design.Q)
 
 
-def test_the_pole_bound_is_a_bound_and_no_worse_than_twice_the_pole():
+def test_the_pole_bound_is_a_bound_and_at_most_eight_times_the_pole():
     random = np.random.default_rng(3)
     for _ in range(50):
         A = random.standard_normal((4, 4)) * 10.0 ** random.uniform(-1, 2)
         fastest = np.max(np.abs(np.linalg.eigvals(A)))
         bound = float(fastest_pole_bound(jnp.asarray(A)))
-        assert fastest * (1 - 1e-9) <= bound <= 2.0 * fastest * 6.0  # |c_k| is a sum of up to 6 products of k poles
+        assert fastest * (1 - 1e-9) <= bound <= 8.0 * fastest * (1 + 1e-9)
+    assert float(fastest_pole_bound(jnp.diag(jnp.full(4, -3.0)))) == pytest.approx(24.0)
