@@ -10,7 +10,17 @@ FOLDER = Path(__file__).parent.parent / "experiments"
 EXPERIMENTS = sorted(path for path in FOLDER.glob("*.py") if not path.name.startswith("_"))
 
 
-SLOW = {"kill_and_resume", "tune_baselines", "tune_seeds"}  # mostly compile; tests/tune covers their parts
+SLOW = {  # a minute of compiling each, or what the package's own tests hold anyway
+    "accuracy",
+    "gradient_accuracy",
+    "gradient_cost",
+    "kill_and_resume",
+    "recover_parameters",
+    "riccati_accuracy",
+    "success_table",
+    "tune_baselines",
+    "tune_seeds",
+}
 
 
 @pytest.fixture(

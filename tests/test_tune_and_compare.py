@@ -10,11 +10,14 @@ from cpjax import io, paper
 from cpjax.controllers import LqrWeights, PoleFactors
 from cpjax.study.comparison import DESIGNS, best, compare, entries, preset
 from cpjax.study.reproduction import Setting
+from cpjax.tune import tuner
+from cpjax.tune.tuner import Tuning
 
 PLANT = paper.appendix_plant()
 SMALL = ("--candidates", "3", "--restarts", "2", "--batch", "2", "--steps", "2", "--duration", "1")
 
 
+@pytest.mark.slow
 def test_tune_writes_a_controller_that_other_commands_take(tmp_path, command):
     done = command("tune", "--out", tmp_path, *SMALL)
     assert done.code == 0
@@ -24,6 +27,33 @@ def test_tune_writes_a_controller_that_other_commands_take(tmp_path, command):
     result = json.loads((tmp_path / "tune.json").read_text())
     assert result["gradient_steps"] == 2 * 2 * 2 * (50 + 32)
     assert io.encode(tuned) == result["controller"]
+    assert (tmp_path / "tune.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_tune_asks_for_what_its_options_say_and_writes_what_it_gets(tmp_path, command, monkeypatch):
+    """The loop itself is tested elsewhere, and takes a minute to compile."""
+    asked = {}
+
+    def pretended(plant, free, plan, *, progress, checkpoint):
+        asked.update(plant=plant, free=free, plan=plan, checkpoint=checkpoint)
+        vector = np.asarray(free.start())
+        record = {"step": 0, "scores": [2.5], "success_rates": [1.0], "settling_times": [2.5], "loss": float("nan")}
+        return Tuning(free.controller, vector, free.labels, vector, 2.5, 1.0, 2.5, [record], 7, 8, 9.0)
+
+    monkeypatch.setattr(tuner, "tune", pretended)
+    options = ["--design", "placement", "--start-from", "paper", "--frozen", "kick_radius, energy_gain", "--seed", "5"]
+    done = command("tune", *options, "--out", tmp_path, "--steps", "3", "--effort", "0.01", "--pole-mass", "0.4")
+    assert done.code == 0, done.err
+    assert "100.00 %" in done.out
+    assert asked["plan"].steps == 3
+    assert asked["plan"].seed == 5
+    assert asked["plan"].goal.effort == 0.01
+    assert asked["plant"].pole_mass == asked["free"].model.pole_mass == 0.4
+    assert "energy_gain" not in asked["free"].labels
+    assert asked["free"].controller.gate.half_angle == paper.SWITCH_ANGLE
+    assert asked["checkpoint"] == tmp_path / "checkpoint.npz"
+    assert isinstance(cpjax.load(tmp_path / "tuned.json").regulator.design, PoleFactors)
+    assert json.loads((tmp_path / "tune.json").read_text())["gradient_steps"] == 8
     assert (tmp_path / "tune.png").read_bytes().startswith(b"\x89PNG")
 
 

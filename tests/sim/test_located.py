@@ -425,7 +425,7 @@ def check_random_draws(count, dtype, chunk):
     assert np.mean(lost != 0) <= 0.01
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("dtype", [pytest.param(jnp.float64, marks=pytest.mark.slow), jnp.float32])
 def test_no_value_and_no_gradient_is_nan_at_random_points(dtype):
     check_random_draws(500, dtype, chunk=500)
 
