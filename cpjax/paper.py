@@ -187,11 +187,7 @@ def regulator(design: Design, gains: Gains, plant: CartPole) -> StateFeedback:
 def design_inputs(design: Design) -> LqrWeights | PoleFactors:
     """What section IV designs the gain from: its weights, or its poles."""
     _check_choice("design", design, get_args(Design))
-    if design == "lqr":
-        return LqrWeights(np.diag(Q), R)
-    return PoleFactors(
-        np.array([-POLES[0] - POLES[1], -POLES[2] - POLES[3]]), np.array([POLES[0] * POLES[1], POLES[2] * POLES[3]])
-    )
+    return LqrWeights(np.diag(Q), R) if design == "lqr" else PoleFactors.from_poles(POLES)
 
 
 def controller(law: str, design: Design, plant: CartPole, gains: Gains = "printed") -> Hybrid:

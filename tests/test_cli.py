@@ -860,6 +860,7 @@ def test_a_report_names_its_setting_and_the_command_that_makes_it_again(report):
     assert "cpjax report --starts hanging --count 8 --seed 1 --duration 12 --dt 0.01" in text
 
 
+@pytest.mark.slow
 def test_a_report_of_odd_numbers_gives_the_command_with_all_their_digits(command, tmp_path, no_pictures, monkeypatch):
     monkeypatch.setattr(reproduction, "evaluate", fake_evaluate)
     for section in ("_designs", "_forensics"):

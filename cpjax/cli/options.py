@@ -27,7 +27,7 @@ from cpjax.controllers import (
 from cpjax.controllers.gates import Gate
 from cpjax.controllers.protocol import Controller, as_controller
 from cpjax.design.lqr import lqr
-from cpjax.design.placement import QuadraticFactors, place
+from cpjax.design.placement import place
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor, linearize
 from cpjax.pytree import Number, rules
@@ -270,20 +270,13 @@ def _build_regulator(changes: dict[str, Any], plant: CartPole, reference: State)
         if "poles" in given:
             poles = parse_poles(given["poles"])
             K = _designed("gain", plant, lambda A, B: place(A, B, poles))
-            return StateFeedback(K, reference, _factors(poles))
+            stable = all(pole.real < 0.0 for pole in poles)  # others are no design that could be tuned
+            return StateFeedback(K, reference, PoleFactors.from_poles(poles) if stable else None)
         Q, R = _weights(weights)
         K = _designed("gain", plant, lambda A, B: lqr(A, B, Q, R).K)
         return StateFeedback(K, reference, LqrWeights(Q, R[0][0]))
     regulator = paper.regulator(given.get("design", "placement"), given.get("gains", "printed"), plant)
     return dataclasses.replace(regulator, reference=reference)
-
-
-def _factors(poles: Sequence[complex]) -> PoleFactors | None:
-    """The design of a placement, if it can be one to tune: stable poles."""
-    if not all(pole.real < 0.0 for pole in poles):
-        return None
-    factors = QuadraticFactors.from_poles(poles)
-    return PoleFactors(np.asarray(factors.a), np.asarray(factors.b))
 
 
 def _designed(what: str, plant: CartPole, design: Callable[[Any, Any], Any]) -> Any:

@@ -1,5 +1,6 @@
 """Linear state feedback, and the two designs that it comes from."""
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -56,6 +57,18 @@ class PoleFactors:
             value = getattr(self, name)
             if not is_traced(value) and not np.all(np.asarray(value) > 0.0):
                 raise InputError(f"PoleFactors.{name}", value, "two numbers above 0: the poles are to be stable")
+
+    @classmethod
+    def from_poles(cls, poles: Array | Sequence[complex]) -> "PoleFactors":
+        """Of four concrete poles; see `QuadraticFactors.from_poles`.
+
+        Raises:
+          InputError: poles that are not four, not stable or not closed under conjugation.
+        """
+        factors = QuadraticFactors.from_poles(poles)
+        if factors.a.shape != (2,):
+            raise InputError("poles", poles, "four of them")
+        return cls(np.asarray(factors.a), np.asarray(factors.b))
 
     @property
     def poles(self) -> jax.Array:

@@ -78,6 +78,7 @@ def test_a_scan_in_segments_is_a_scan(n):
     np.testing.assert_allclose(whole, segments, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_segments_keep_less():
     def cost(p, start, checkpoint):
         law = cpjax.EnergySwingUp(PLANT, energy_gain=p)

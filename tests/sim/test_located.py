@@ -221,6 +221,7 @@ def test_a_demand_that_jumps_from_one_limit_past_the_other_never_exceeds_the_sup
     assert 0.0 <= run.metrics.effort <= 144.0 * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_held_just_after_a_crossing_counts_it_once():
     inside = State(0.0, 0.0, 0.6, -3.0)
     plant = replace(PLANT, motor=replace(PLANT.motor, voltage_limit=1e4))

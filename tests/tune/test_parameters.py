@@ -7,7 +7,7 @@ import pytest
 
 import cpjax
 from cpjax import paper
-from cpjax.controllers import AngleRateGate, EnergySwingUp, Hybrid, LqrWeights, LyapunovGate, StateFeedback
+from cpjax.controllers import AngleRateGate, EnergySwingUp, Hybrid, LqrWeights, LyapunovGate, PoleFactors, StateFeedback
 from cpjax.errors import InputError
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.starting import beginning
@@ -94,6 +94,15 @@ def test_a_design_is_saved_beside_its_gain(tmp_path):
     loaded = cpjax.load(tmp_path / "law.json")
     assert isinstance(loaded.design, LqrWeights)
     np.testing.assert_array_equal(loaded.design.Q, regulator.design.Q)
+
+
+def test_factors_of_poles_have_these_poles_and_want_four_stable_ones():
+    factors = PoleFactors.from_poles([-3.0, -4.0, -5.0 + 2.0j, -5.0 - 2.0j])
+    np.testing.assert_allclose(np.sort_complex(factors.poles), [-5.0 - 2.0j, -5.0 + 2.0j, -4.0, -3.0], rtol=1e-12)
+    np.testing.assert_allclose(factors.polynomial, np.poly(factors.poles).real[1:], rtol=1e-12)
+    for poles in ([-1.0, -2.0, -3.0], [-1.0, -2.0, -3.0, 4.0]):
+        with pytest.raises(InputError, match="poles"):
+            PoleFactors.from_poles(poles)
 
 
 def test_the_pole_bound_is_a_bound_and_at_most_eight_times_the_pole():
