@@ -1,10 +1,11 @@
-"""A tuning killed (SIGKILL) at ten random moments and resumed each time, against one that was never stopped.
+"""Tunings killed (SIGKILL) at ten random moments and resumed, against one that was never stopped.
 
     python experiments/kill_and_resume.py
 
-Both write a controller; the two files have to be the same, byte for byte.
+Each is a tuning of its own, in its own folder. All controllers have to be the same file, byte for byte.
 """
 
+import os
 import subprocess
 import sys
 import time
@@ -25,31 +26,50 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
     """Prints what happened and writes kill_and_resume.json."""
     random = np.random.default_rng(seed)
     size = (*BUDGET, *(TINY if quick else SMALL))
-    whole, stopped = out / "whole", out / "stopped"
+    _run(out / "warm", size, out)  # fills the compiler's cache
     began = time.monotonic()
-    subprocess.run(_command(whole, size), check=True, capture_output=True)
+    _run(out / "whole", size, out)
     length = time.monotonic() - began
-    kills = []
-    for _ in range(1 if quick else 10):
-        wait = float(random.uniform(0.3, 0.95) * length)
-        process = subprocess.Popen(_command(stopped, size), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        try:
-            process.wait(wait)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            kills.append(wait)
-        print(f"after {wait:.1f} s: {'killed' if process.returncode else 'had finished'}", flush=True)
-    subprocess.run(_command(stopped, size), check=True, capture_output=True)
-    same = (whole / "tuned.json").read_bytes() == (stopped / "tuned.json").read_bytes()
+    expected = (out / "whole" / "tuned.json").read_bytes()
+    kills: list[dict[str, Any]] = []
+    for i in range(1 if quick else 10):
+        folder, moment = out / f"killed-{i}", float(random.uniform(0.1, 0.95) * length)
+        finished = _run(folder, size, out, until=moment)
+        saved = (folder / "checkpoint.npz").exists()
+        _run(folder, size, out)
+        same = (folder / "tuned.json").read_bytes() == expected
+        kills.append({"moment": moment, "killed": not finished, "checkpoint": saved, "identical": same})
+        print(
+            f"after {moment:5.1f} of {length:.1f} s: {'had finished' if finished else 'killed'}, "
+            f"{'a' if saved else 'no'} checkpoint; resumed: {'identical' if same else 'DIFFERENT'}",
+            flush=True,
+        )
+    same = all(kill["identical"] for kill in kills)
     result = {"versions": io.versions(), "length": length, "kills": kills, "identical": same}
-    print(f"{len(kills)} kills; the two controllers are {'identical' if same else 'DIFFERENT'}")
+    print(f"{sum(kill['killed'] for kill in kills)} kills; all ended {'identical' if same else 'NOT IDENTICAL'}")
     io.write_json(out / "kill_and_resume.json", result)
     return result
 
 
-def _command(out: Path, size: tuple[str, ...]) -> list[str]:
-    return [sys.executable, "-m", "cpjax", "tune", *size, "--out", str(out)]
+def _run(folder: Path, size: tuple[str, ...], out: Path, until: float | None = None) -> bool:
+    """Runs a tuning to its end, or kills it after so many seconds; whether it ended by itself."""
+    command = [sys.executable, "-m", "cpjax", "tune", *size, "--out", str(folder)]
+    cache = {
+        "JAX_COMPILATION_CACHE_DIR": str((out / "cache").absolute()),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    process = subprocess.Popen(
+        command, env={**os.environ, **cache}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        code = process.wait(until)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        return False
+    if code:
+        raise RuntimeError(f"{' '.join(command)} ended with {code}")
+    return True
 
 
 if __name__ == "__main__":
