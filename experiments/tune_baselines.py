@@ -11,7 +11,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeAlias, get_args
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,8 @@ from cpjax.tune.parameters import FreeParameters, free_parameters
 from cpjax.tune.starting import beginning
 
 HORIZON, DT, STARTS, EVALUATIONS = 5.0, 0.004, 192, 2240
-Score = Callable[[np.ndarray[Any, Any]], np.ndarray[Any, Any]]
+Numbers: TypeAlias = np.ndarray[Any, Any]
+Score: TypeAlias = Callable[[Numbers], Numbers]
 
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
@@ -42,14 +43,21 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     for method, design, number in itertools.product(_SEARCHES, designs, range(seed, seed + (1 if quick else 5))):
         free = free_parameters(beginning("bland", design, plant))
         began = time.perf_counter()
-        found = _SEARCHES[method](_score(free, number, 4 if quick else STARTS), free, number, evaluations)
+        score, asked = _score(free, number, 4 if quick else STARTS), 0
+
+        def counted(vectors: Numbers, score: Score = score) -> Numbers:
+            nonlocal asked
+            asked += len(vectors)
+            return score(vectors)
+
+        found = _SEARCHES[method](counted, free, number, evaluations)
         if found is None:
             print(f"{method} needs the package cma: left out")
             continue
         seconds = time.perf_counter() - began
         law = free.build(jnp.asarray(found))
         judged = summarise(sweep(plant, law, unseen, duration=20.0, dt=0.002, clock="sampled"))
-        cost = evaluations * STARTS * round(HORIZON / DT)
+        cost = asked * STARTS * round(HORIZON / DT)  # Nelder-Mead may stop before it has to
         names = {"design": design, "method": method, "seed": number, "steps": cost, "seconds": seconds}
         rows.append({**names, "parameters": free.physical(jnp.asarray(found)), "evaluation": judged})
         print(
@@ -75,36 +83,36 @@ def _score(free: FreeParameters, seed: int, count: int) -> Score:
 
         return jax.lax.map(one, vectors)
 
-    def finite(vectors: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def finite(vectors: Numbers) -> Numbers:
         return np.nan_to_num(np.asarray(of_all(jnp.asarray(vectors))), nan=2.0 * HORIZON)
 
     return finite
 
 
-def _random(score: Score, free: FreeParameters, seed: int, evaluations: int) -> np.ndarray[Any, Any]:
+def _random(score: Score, free: FreeParameters, seed: int, evaluations: int) -> Numbers:
     vectors = free.draw(np.random.default_rng(seed), evaluations)
     vectors[0] = np.asarray(free.start())
     values = np.concatenate([score(part) for part in _parts(vectors)])
-    best: np.ndarray[Any, Any] = vectors[int(np.argmin(values))]
+    best: Numbers = vectors[int(np.argmin(values))]
     return best
 
 
-def _parts(vectors: np.ndarray[Any, Any]) -> Iterator[np.ndarray[Any, Any]]:
+def _parts(vectors: Numbers) -> Iterator[Numbers]:
     for i in range(0, len(vectors), 14):
         yield vectors[i : i + 14]
 
 
-def _nelder_mead(score: Score, free: FreeParameters, seed: int, evaluations: int) -> np.ndarray[Any, Any]:
+def _nelder_mead(score: Score, free: FreeParameters, seed: int, evaluations: int) -> Numbers:
     start = np.asarray(free.start())
     simplex = start + np.concatenate([np.zeros((1, start.size)), 0.5 * np.eye(start.size)])
     simplex[1:] += 0.1 * np.random.default_rng(seed).standard_normal((start.size, start.size))
     options = {"maxfev": evaluations, "initial_simplex": simplex, "xatol": 1e-6, "fatol": 1e-6}
     found = minimize(lambda x: float(score(x[None])[0]), start, method="Nelder-Mead", options=options)
-    best: np.ndarray[Any, Any] = found.x
+    best: Numbers = found.x
     return best
 
 
-def _cma_es(score: Score, free: FreeParameters, seed: int, evaluations: int) -> np.ndarray[Any, Any] | None:
+def _cma_es(score: Score, free: FreeParameters, seed: int, evaluations: int) -> Numbers | None:
     try:
         import cma
     except ImportError:
@@ -114,7 +122,7 @@ def _cma_es(score: Score, free: FreeParameters, seed: int, evaluations: int) -> 
     for _ in range(evaluations // 14):
         vectors = search.ask()
         search.tell(vectors, list(score(np.array(vectors))))
-    best: np.ndarray[Any, Any] = search.best.x
+    best: Numbers = search.best.x
     return best
 
 
