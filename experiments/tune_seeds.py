@@ -6,13 +6,13 @@ Each tuned law is evaluated as docs/protocol.md says, from exact rest too, at a 
 continuous clock with located switching. A finished tuning is kept in the folder and not done again.
 """
 
-import os
 from pathlib import Path
 from typing import Any, get_args
 
 import jax
 import numpy as np
 from _common import run
+from _tuned import QUICK, tuned, use_fast_gradients
 
 from cpjax import io, paper
 from cpjax.controllers import Hybrid, StateFeedback
@@ -24,18 +24,8 @@ from cpjax.study.summary import summarise
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
 from cpjax.tune.starting import beginning
-from cpjax.tune.tuner import document, tune
 
 EVALUATION_SEED = 20_000
-QUICK: dict[str, Any] = {
-    "candidates": 4,
-    "restarts": 2,
-    "steps": 2,
-    "batch": 2,
-    "screening": 2,
-    "validation": 4,
-    "final": 4,
-}
 
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
@@ -52,13 +42,8 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
         plan = Plan(seed=number, **(QUICK if quick else {}))
         free = free_parameters(beginning(begin, design, plant))
         case = f"{name}-{design}-{begin}-{number}"
-        path = out / f"{case}.json"
-        if not path.exists():
-            tuning = tune(plant, free, plan, checkpoint=out / f"{case}.npz")
-            io.write_json(out / f"{case}.tune.json", document(tuning, plant, plan))
-            io.save(path, tuning.controller)
-        made = io.read_table(out / f"{case}.tune.json")
-        judged = judge(plant, io.load(path), 64 if quick else 10_000)
+        controller, made = tuned(out, case, plant, free, plan)
+        judged = judge(plant, controller, 64 if quick else 10_000)
         row = {"plant": name, "design": design, "from": begin, "seed": number, **judged}
         row |= {key: made[key] for key in ("value_steps", "gradient_steps", "seconds")}
         rows.append(row)
@@ -99,6 +84,5 @@ def judge(plant: CartPole, controller: Hybrid, count: int) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    # The tuner's gradients run about twice as fast with this option of XLA's, which has to be set before JAX starts.
-    os.environ.setdefault("XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true")
+    use_fast_gradients()
     run(main, __doc__ or "")

@@ -18,8 +18,11 @@ SLOW = {  # a minute of compiling each, or what the package's own tests hold any
     "recover_parameters",
     "riccati_accuracy",
     "success_table",
+    "tune_anywhere",
     "tune_baselines",
+    "tune_robust",
     "tune_seeds",
+    "tune_track",
 }
 
 

@@ -16,7 +16,7 @@ from cpjax.errors import InputError
 from cpjax.starts import START_SETS
 from cpjax.tune.objective import Goal
 from cpjax.tune.parameters import free_parameters
-from cpjax.tune.plan import Plan
+from cpjax.tune.plan import AGGREGATES, Plan
 from cpjax.tune.starting import beginning
 
 _DEFAULTS = {field.name: field.default for field in dataclasses.fields(Plan)}
@@ -30,6 +30,8 @@ _PLANNED = {
     "dt": "their step [s]",
     "first_width": "of the target, at first [rad and m]",
     "last_width": "of the target, in the end [rad and m]",
+    "temperature": "of a soft maximum or a success-weighted mean [s]",
+    "threshold": "of a success-weighted mean [s]",
     "tail": "share of the worst starts that the mean is taken over",
     "explore": "noise when the worse half of the restarts goes on from the better",
     "patience": "validations without progress after which to end; 0 for never",
@@ -43,6 +45,7 @@ OPTIONS = [
     Option("tune", "free", "the only parameters to change, with commas between"),
     Option("tune", "full_q", "a full state weight (default diagonal)", choices=("full", "diagonal"), flag="q-shape"),
     Option("tune", "starts", "set of starts (default hanging)", choices=START_SETS),
+    Option("tune", "aggregate", "of a batch's starts (default tail, a mean)", choices=AGGREGATES),
     *(
         Option("tune", name, f"{text} (default {_DEFAULTS[name]:g})", type(_DEFAULTS[name]))
         for name, text in _PLANNED.items()

@@ -113,7 +113,8 @@ class FreeParameters:
             low, high = slot.low, slot.high
             for i in range(slot.size):
                 if slot.kind == "logit":
-                    share = random.uniform(low, high, count) / self._top(slot.name)
+                    top = self._top(slot.name)
+                    share = random.uniform(low, min(high, 0.98 * top), count) / top
                     columns.append(np.log(share) - np.log1p(-share))
                 elif slot.kind == "full" and i >= 4:
                     columns.append(random.uniform(-0.5, 0.5, count))
@@ -231,7 +232,7 @@ def _ranges(controller: Hybrid) -> Mapping[str, tuple[float, float]]:
         "R": (1e-4, 1.0),
         "a": (0.8 * w, 5.0 * w),
         "b": (0.5 * w * w, 4.5 * w * w),
-        "half_angle": (0.3, 0.98 * math.pi),
+        "half_angle": (0.3, math.pi),
         "rate": (0.5 * w, 4.0 * w),
         "level": (0.1 * natural.level, 30.0 * natural.level),
         "hysteresis": (0.01, 0.3),

@@ -2,13 +2,16 @@
 
 import dataclasses
 import math
+from collections.abc import Callable, Mapping
 from typing import Any
+
+import jax
 
 from cpjax.errors import InputError
 from cpjax.pytree import Number
 from cpjax.sim.settings import check_settings
 from cpjax.starts import START_SETS
-from cpjax.tune.objective import Goal
+from cpjax.tune.objective import Aggregate, Goal, soft_maximum, success_weighted, tail_mean
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +35,10 @@ class Plan:
       spare_steps: theirs, for crossings; a run that needs more counts up to there.
       first_width: the target's at first [rad and m].
       last_width: and after six tenths of the steps, reached geometrically.
+      aggregate: what makes one number of a batch: the mean over a `tail`, a soft maximum or a success-weighted mean.
       tail: share of the worst starts that the mean is taken over; 1 for all.
+      temperature: of a soft maximum or a success-weighted mean [s].
+      threshold: of a success-weighted mean [s].
       clip: a start's gradient is shortened to this many times the batch's median norm.
       validate_every: steps between validations, each of which may be the last kept.
       validation: starts of a validation, the same ones each time.
@@ -51,8 +57,8 @@ class Plan:
     starts: str = "hanging"
     seed: int = 1
     goal: Goal = dataclasses.field(default_factory=Goal)
-    candidates: int = 1024
-    screening: int = 16
+    candidates: int = 4095
+    screening: int = 4
     restarts: int = 8
     batch: int = 16
     steps: int = 80
@@ -60,10 +66,13 @@ class Plan:
     learning_rate: float = 0.05
     duration: float = 4.0
     dt: float = 0.02
-    spare_steps: int = 32
+    spare_steps: int = 64
     first_width: float = 0.2
     last_width: float = 0.03
+    aggregate: str = "tail"
     tail: float = 1.0
+    temperature: float = 0.3
+    threshold: float = 3.0
     clip: float = 2.0
     validate_every: int = 5
     validation: int = 128
@@ -73,13 +82,15 @@ class Plan:
     final_horizon: float = 10.0
     final_dt: float = 0.002
     horizon: float = 5.0
-    horizon_dt: float = 0.005
+    horizon_dt: float = 0.008
     pole_limit: float = 250.0
     plant_spread: float = 0.0
 
     def __post_init__(self) -> None:
         if not isinstance(self.starts, str) or self.starts not in START_SETS:
             raise InputError("starts", self.starts, "one of " + ", ".join(START_SETS))
+        if not isinstance(self.aggregate, str) or self.aggregate not in _AGGREGATES:
+            raise InputError("aggregate", self.aggregate, "one of " + ", ".join(_AGGREGATES))
         if not isinstance(self.goal, Goal):
             raise InputError("goal", self.goal, "a cpjax.tune Goal")
         for name, least in _COUNTS.items():
@@ -94,6 +105,10 @@ class Plan:
         if self.restarts > self.candidates + 1:
             raise InputError("restarts", self.restarts, f"at most candidates + 1, {self.candidates + 1}")
 
+    def aggregated(self, values: jax.Array) -> jax.Array:
+        """One number of the values of a batch (n,)."""
+        return _AGGREGATES[self.aggregate](self)(values)
+
     def width(self, step: int) -> float:
         """The target's at a step [rad and m]."""
         done = min(1.0, step / max(1.0, 0.6 * self.steps))
@@ -103,6 +118,14 @@ class Plan:
         """As plain values."""
         return dataclasses.asdict(self)
 
+
+_AGGREGATES: Mapping[str, Callable[[Plan], Aggregate]] = {
+    "tail": lambda plan: tail_mean(plan.tail),
+    "soft-maximum": lambda plan: soft_maximum(plan.temperature),
+    "success-weighted": lambda plan: success_weighted(plan.threshold, plan.temperature),
+}
+AGGREGATES = tuple(_AGGREGATES)
+"""Names that a `Plan` knows."""
 
 _COUNTS = {
     "seed": 0,
@@ -124,6 +147,8 @@ _NUMBERS = {
     "first_width": Number("rad and m", "", above=0.0),
     "last_width": Number("rad and m", "", above=0.0),
     "tail": Number("1", "", above=0.0, at_most=1.0),
+    "temperature": Number("s", "", above=0.0),
+    "threshold": Number("s", "", above=0.0),
     "clip": Number("1", "", above=0.0, infinite=True),
     "pole_limit": Number("1/s", "", above=0.0, infinite=True),
     "plant_spread": Number("1", "", at_least=0.0, below=1.0),

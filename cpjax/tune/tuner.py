@@ -23,11 +23,11 @@ from cpjax.controllers import Hybrid, StateFeedback
 from cpjax.errors import InputError
 from cpjax.numeric.statistics import wilson_interval
 from cpjax.plant import CartPole, linearize
+from cpjax.sim.flags import Flag
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import measure
 from cpjax.starts import sample_starts
 from cpjax.state import State
-from cpjax.tune.objective import tail_mean
 from cpjax.tune.parameters import FreeParameters, Vector
 from cpjax.tune.plan import Plan
 from cpjax.tune.plants import sample_plants
@@ -136,6 +136,8 @@ class _Tuner:
         schedule = optax.cosine_decay_schedule(plan.learning_rate, max(1, plan.steps), 0.05)
         self.optimiser = optax.adam(schedule)
         self.fold = ProtocolMetrics(track_limit=plan.goal.track_limit)
+        self.located: dict[str, Any] = {"duration": plan.duration, "dt": plan.dt, "switching": "located"}
+        self.located["spare_steps"] = plan.spare_steps
         self.iterations = round(plan.duration / plan.dt) + plan.spare_steps
         self.gradient = jax.jit(jax.vmap(self._gradient, in_axes=(0, None, None, None)))
         self.values = jax.jit(self._values, static_argnames=("horizon", "dt"))
@@ -154,10 +156,15 @@ class _Tuner:
         given = np.asarray(self.free.start())[None]
         random = np.random.default_rng(_seed(plan, _SCREEN, 1))
         vectors = np.concatenate([given, self.free.draw(random, plan.candidates).astype(given.dtype)])
-        scores, _, _ = self._score(vectors, plan.screening, _SCREEN)
-        order = [0, *(int(i) for i in np.argsort(scores, kind="stable") if i != 0)][: plan.restarts]
-        chosen = vectors[order]
-        steps = len(vectors) * plan.screening * self._horizon_steps
+        starts, steps = plan.screening, 0
+        while True:  # successive halving, by quarters (Jamieson and Talwalkar, 2016)
+            scores, _, _ = self._score(vectors, starts, _SCREEN)
+            steps += len(vectors) * self._value_steps(starts)
+            order = [0, *(int(i) for i in np.argsort(scores, kind="stable") if i != 0)]
+            if len(vectors) <= 16 * plan.restarts:
+                break
+            vectors, starts = vectors[order[: max(plan.restarts, len(vectors) // 4)]], 4 * starts
+        chosen = vectors[order[: plan.restarts]]
         start = _Memory(
             0, chosen, self.optimiser.init(jnp.asarray(chosen)), chosen, np.full(len(chosen), np.inf), 0, [], steps, 0
         )
@@ -221,7 +228,7 @@ class _Tuner:
             success_rate=float(rates[best]),
             settling_time=float(times[best]),
             history=memory.history,
-            value_steps=memory.value_steps + len(chosen) * plan.final * round(plan.final_horizon / plan.final_dt),
+            value_steps=memory.value_steps + len(chosen) * self._value_steps(plan.final, final=True),
             gradient_steps=memory.gradient_steps,
             seconds=time.perf_counter() - began,
         )
@@ -244,12 +251,14 @@ class _Tuner:
             scores=np.where(better, scores, memory.scores),
             stale=0 if improved else memory.stale + 1,
             history=[*memory.history, record],
-            value_steps=memory.value_steps + len(scores) * plan.validation * self._horizon_steps,
+            value_steps=memory.value_steps + len(scores) * self._value_steps(plan.validation),
         )
 
-    @property
-    def _horizon_steps(self) -> int:
-        return round(self.plan.horizon / self.plan.horizon_dt)
+    def _value_steps(self, starts: int, *, final: bool = False) -> int:
+        """RK4 steps of a score from so many starts."""
+        plan = self.plan
+        horizon, dt = (plan.final_horizon, plan.final_dt) if final else (plan.horizon, plan.horizon_dt)
+        return starts * round(horizon / dt) + _watched(starts) * self.iterations
 
     def _draw(self, count: int, purpose: int, step: int = 0) -> tuple[State, CartPole | None]:
         plan = self.plan
@@ -266,23 +275,12 @@ class _Tuner:
         plan = self.plan
 
         def objective(vector: Vector, start: State, plant: CartPole) -> jax.Array:
-            value: jax.Array = measure(
-                plant,
-                self.free.build(vector),
-                start,
-                duration=plan.duration,
-                dt=plan.dt,
-                switching="located",
-                spare_steps=plan.spare_steps,
-                metrics=plan.goal.fold(self.free.model, width),
-            )
+            fold = plan.goal.fold(self.free.model, width)
+            value: jax.Array = measure(plant, self.free.build(vector), start, **self.located, metrics=fold)
             return value
 
         value_and_grad = jax.value_and_grad(objective)
-        if plants is None:
-            values, slopes = jax.vmap(lambda start: value_and_grad(vector, start, self.plant))(starts)
-        else:
-            values, slopes = jax.vmap(lambda start, plant: value_and_grad(vector, start, plant))(starts, plants)
+        values, slopes = self._over(lambda start, plant: value_and_grad(vector, start, plant), starts, plants)
         sound = jnp.all(jnp.isfinite(slopes), axis=1) & jnp.isfinite(values)
         slopes = jnp.where(sound[:, None], slopes, 0.0)
         norms = jnp.sqrt(jnp.sum(slopes * slopes, axis=1))
@@ -291,7 +289,7 @@ class _Tuner:
         shortened = jnp.minimum(1.0, plan.clip * median / jnp.maximum(norms, tiny))
         worst = jnp.max(jnp.where(sound, values, -jnp.inf))
         values = jnp.where(sound, values, worst)
-        loss, shares = jax.value_and_grad(tail_mean(plan.tail))(values)
+        loss, shares = jax.value_and_grad(plan.aggregated)(values)
         slope = jnp.sum((shares * shortened)[:, None] * slopes, axis=0)
         hurry = jnp.nan_to_num(jax.grad(self._haste)(vector))
         return loss, slope + hurry
@@ -317,38 +315,45 @@ class _Tuner:
         return np.asarray(scores), np.asarray(rates), np.asarray(times)
 
     def _values(self, vectors: jax.Array, starts: State, plants: CartPole | None, *, horizon: float, dt: float) -> Any:
-        plan, goal = self.plan, self.plan.goal
+        plan, goal, count = self.plan, self.plan.goal, jnp.shape(starts.x)[0]
 
         def one(vector: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
             controller = self.free.build(vector)
 
             def run(start: State, plant: CartPole) -> Metrics:
-                found: Metrics = measure(
-                    plant,
-                    controller,
-                    start,
-                    duration=horizon,
-                    dt=dt,
-                    clock="sampled",
-                    metrics=self.fold,
-                )
+                settings: dict[str, Any] = {"duration": horizon, "dt": dt, "clock": "sampled", "metrics": self.fold}
+                found: Metrics = measure(plant, controller, start, **settings)
                 return found
 
-            runs = (
-                jax.vmap(lambda start: run(start, self.plant))(starts)
-                if plants is None
-                else jax.vmap(run)(starts, plants)
-            )
+            def slides(start: State, plant: CartPole) -> jax.Array:
+                """Along the gate's boundary, with more crossings than can be located."""
+                found: Metrics = measure(plant, controller, start, **self.located, metrics=self.fold)
+                return (found.flag & Flag.OVERFLOW) != 0
+
+            runs = self._over(run, starts, plants)
+            some = jax.tree.map(lambda column: column[: _watched(count)], (starts, plants))
             cost = jnp.where(runs.success, runs.settling_time, _FAILURE * horizon)
             cost = cost + goal.effort * runs.effort + goal.jerkiness * runs.voltage_variation
             rate = jnp.mean(runs.success.astype(cost.dtype))
             settled = jnp.mean(jnp.where(runs.success, runs.settling_time, 0.0)) / rate  # NaN without a success
+            sliding = jnp.mean(self._over(slides, *some).astype(cost.dtype))
             slow = jnp.max(jnp.abs(jnp.linalg.eigvals(self._closed_loop(vector)))) <= plan.pole_limit
-            score = jnp.where(slow, jnp.mean(cost), jnp.inf)
+            score = jnp.where(slow, jnp.mean(cost) + _FAILURE * horizon * sliding, jnp.inf)
             return jnp.where(jnp.isnan(score), jnp.inf, score), rate, settled
 
-        lanes = max(1, 512 // jnp.shape(starts.x)[0])
+        lanes = max(1, 512 // count)
         return jax.lax.map(one, vectors, batch_size=min(lanes, vectors.shape[0]))
+
+    def _over(self, one: Callable[[State, CartPole], Any], starts: State, plants: CartPole | None) -> Any:
+        """`one` of every start, on the plant or on a plant of its own."""
+        if plants is None:
+            return jax.vmap(lambda start: one(start, self.plant))(starts)
+        return jax.vmap(one)(starts, plants)
+
+
+def _watched(count: int) -> int:
+    """Of so many starts, how many are run with located switching too."""
+    return min(count, max(16, count // 8))
 
 
 def fastest_pole_bound(A: jax.Array) -> jax.Array:

@@ -1,0 +1,85 @@
+"""A plant that is not the one the controller was made for: nominal tunings and tunings over random plants.
+
+    python experiments/tune_robust.py
+
+1,000 plants, parameters within 20 % of the appendix's, one at a time and all together; four `hanging` starts for each.
+The law's own model of the plant stays the nominal one, and so does its regulator. Beside the nominal tunings (the
+controllers that ship) stand tunings over plants that are drawn anew for each start. A finished tuning is kept in the
+folder and not done again.
+"""
+
+from pathlib import Path
+from typing import Any, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _common import run
+from _tuned import QUICK, tuned, use_fast_gradients
+
+from cpjax import io, paper
+from cpjax.controllers import Hybrid
+from cpjax.numeric.statistics import wilson_interval
+from cpjax.plant import CartPole
+from cpjax.sim.metrics import Metrics
+from cpjax.sim.rollout import measure
+from cpjax.starts import sample_starts
+from cpjax.state import State
+from cpjax.study.comparison import preset
+from cpjax.tune.parameters import free_parameters
+from cpjax.tune.plan import Plan
+from cpjax.tune.plants import UNCERTAIN, sample_plants
+from cpjax.tune.starting import beginning
+
+EVALUATION_SEED = 20_000
+SPREAD, PER_PLANT = 0.2, 4
+PLAN: dict[str, Any] = {"plant_spread": SPREAD, "horizon": 6.0}
+
+
+def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
+    """Prints a line for each set of plants and writes tune_robust.json."""
+    nominal = paper.appendix_plant()
+    count = 16 if quick else 1_000
+    starts = sample_starts("hanging", PER_PLANT * count, seed=EVALUATION_SEED)
+    controllers: dict[str, Hybrid] = {}
+    for design in get_args(paper.Design)[: 1 if quick else None]:
+        plan = Plan(seed=seed, **PLAN, **(QUICK if quick else {}))
+        free = free_parameters(beginning("bland", design, nominal))
+        controllers[f"{design}, nominal"] = preset(design)
+        controllers[f"{design}, over plants"], _ = tuned(out, f"{design}-{seed}", nominal, free, plan)
+    print(f"{'success [%]':20}" + "".join(f"{name:>24}" for name in controllers))
+    rows = []
+    for only in ("nothing", *UNCERTAIN, "everything")[: 2 if quick else None]:
+        chosen = None if only in ("nothing", "everything") else only
+        spread = 0.0 if only == "nothing" else SPREAD
+        plants = sample_plants(nominal, count, spread=spread, seed=EVALUATION_SEED, only=chosen)
+        plants = jax.tree.map(lambda column: np.repeat(column, PER_PLANT), plants)
+        row: dict[str, Any] = {"varied": only}
+        for name, controller in controllers.items():
+            found = _evaluate(controller, plants, starts)
+            good = np.asarray(found.success)
+            row[name] = {
+                "success_rate": float(np.mean(good)),
+                "success_interval": wilson_interval(int(good.sum()), good.size),
+                "plants_that_never_fail": float(np.mean(np.all(good.reshape(count, PER_PLANT), axis=1))),
+                "settling_time": float(np.mean(np.asarray(found.settling_time)[good])) if good.any() else None,
+            }
+        rows.append(row)
+        print(f"{only:20}" + "".join(f"{100 * row[name]['success_rate']:24.2f}" for name in controllers), flush=True)
+        io.write_json(out / "tune_robust.json", {"versions": io.versions(), "seed": seed, "rows": rows})
+    return rows
+
+
+@jax.jit
+def _evaluate(controller: Hybrid, plants: CartPole, starts: State) -> Metrics:
+    def one(plant: CartPole, start: State) -> Metrics:
+        found: Metrics = measure(plant, controller, start, duration=20.0, dt=0.002, clock="sampled")
+        return found
+
+    found: Metrics = jax.vmap(one)(jax.tree.map(jnp.asarray, plants), jax.tree.map(jnp.asarray, starts))
+    return found
+
+
+if __name__ == "__main__":
+    use_fast_gradients()
+    run(main, __doc__ or "")
