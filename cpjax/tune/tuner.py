@@ -6,8 +6,10 @@ start and what to keep, and gradients do the work in between.
 """
 
 import dataclasses
+import functools
 import io as buffers
 import json
+import operator
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -37,6 +39,7 @@ Report = Callable[[int, int, str], None]
 
 _FAILURE = 3.0  # what a start that fails counts, in horizons
 _SCREEN, _STEP, _VALIDATE, _FINAL = range(4)
+_BLOCK, _CONTROLLERS = 512, 64  # lanes that are simulated, and controllers that are designed, at once
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +143,10 @@ class _Tuner:
         self.located["spare_steps"] = plan.spare_steps
         self.iterations = round(plan.duration / plan.dt) + plan.spare_steps
         self.gradient = jax.jit(jax.vmap(self._gradient, in_axes=(0, None, None, None)))
-        self.values = jax.jit(self._values, static_argnames=("horizon", "dt"))
+        self.controllers = jax.jit(jax.vmap(self._controller))
+        self.validated = self._runs(duration=plan.horizon, dt=plan.horizon_dt, clock="sampled")
+        self.evaluated = self._runs(duration=plan.final_horizon, dt=plan.final_dt, clock="sampled")
+        self.located_runs = self._runs(**self.located)
         document = {
             "plan": plan.table(),
             "plant": io.encode(plant),
@@ -149,6 +155,10 @@ class _Tuner:
             "versions": io.versions(),
         }
         self.identity = io.dump_json(document)
+
+    def _runs(self, **settings: Any) -> Any:
+        """Metrics of controllers (n,) from starts (n,), each on the plant or on one of its own."""
+        return jax.jit(jax.vmap(functools.partial(self._run, **settings)))
 
     def begin(self) -> _Memory:
         """Screens the candidates; the first restart is the given controller."""
@@ -307,48 +317,59 @@ class _Tuner:
         return A - B @ jnp.asarray(regulator.K)
 
     def _score(self, vectors: Numbers, count: int, purpose: int) -> tuple[Numbers, Numbers, Numbers]:
-        """Score, success rate and mean settling time of each vector."""
+        """Score, success rate and mean settling time of each vector (n,), from `count` starts."""
+        plan, goal = self.plan, self.plan.goal
         starts, plants = self._draw(count, purpose)
-        plan = self.plan
-        horizon, dt = (plan.final_horizon, plan.final_dt) if purpose == _FINAL else (plan.horizon, plan.horizon_dt)
-        scores, rates, times = self.values(jnp.asarray(vectors), starts, plants, horizon=horizon, dt=dt)
-        return np.asarray(scores), np.asarray(rates), np.asarray(times)
+        final = purpose == _FINAL
+        horizon = plan.final_horizon if final else plan.horizon
+        block = min(_BLOCK, plan.restarts * plan.validation)
+        controllers, poles = _in_blocks(self.controllers, min(block, _CONTROLLERS), jnp.asarray(vectors))
 
-    def _values(self, vectors: jax.Array, starts: State, plants: CartPole | None, *, horizon: float, dt: float) -> Any:
-        plan, goal, count = self.plan, self.plan.goal, jnp.shape(starts.x)[0]
+        def over(run: Any, starts_each: int) -> Any:
+            """Of every controller from the first `starts_each` starts: arrays (n, starts_each)."""
+            which, start = np.divmod(np.arange(len(vectors) * starts_each), starts_each)
+            chosen = jax.tree.map(lambda column: column[which], controllers)
+            drawn = jax.tree.map(lambda column: column[start], (starts, plants))
+            found = _in_blocks(run, block, chosen, *drawn)
+            return jax.tree.map(lambda column: column.reshape(len(vectors), starts_each), found)
 
-        def one(vector: Vector) -> tuple[jax.Array, jax.Array, jax.Array]:
-            controller = self.free.build(vector)
+        runs = over(self.evaluated if final else self.validated, count)
+        # What has more crossings than can be located slides along its gate's boundary, and chatters on a real rig.
+        sliding = (over(self.located_runs, _watched(count)).flag & Flag.OVERFLOW) != 0
+        cost = np.where(runs.success, runs.settling_time, _FAILURE * horizon)
+        cost = cost + goal.effort * runs.effort + goal.jerkiness * runs.voltage_variation
+        score = np.mean(cost, axis=1) + _FAILURE * horizon * np.mean(sliding, axis=1)
+        score = np.where(np.isnan(score) | ~(poles <= plan.pole_limit), np.inf, score)
+        successes = np.sum(runs.success, axis=1)
+        settled = np.sum(np.where(runs.success, runs.settling_time, 0.0), axis=1)
+        settled = np.where(successes > 0, settled / np.maximum(successes, 1), np.nan)
+        return score, successes / count, settled
 
-            def run(start: State, plant: CartPole) -> Metrics:
-                settings: dict[str, Any] = {"duration": horizon, "dt": dt, "clock": "sampled", "metrics": self.fold}
-                found: Metrics = measure(plant, controller, start, **settings)
-                return found
+    def _controller(self, vector: Vector) -> tuple[Hybrid, jax.Array]:
+        """The controller, and the magnitude of its fastest closed-loop pole [1/s]."""
+        poles = jnp.linalg.eigvals(self._closed_loop(vector))
+        return self.free.build(vector), jnp.max(jnp.abs(poles))
 
-            def slides(start: State, plant: CartPole) -> jax.Array:
-                """Along the gate's boundary, with more crossings than can be located."""
-                found: Metrics = measure(plant, controller, start, **self.located, metrics=self.fold)
-                return (found.flag & Flag.OVERFLOW) != 0
-
-            runs = self._over(run, starts, plants)
-            some = jax.tree.map(lambda column: column[: _watched(count)], (starts, plants))
-            cost = jnp.where(runs.success, runs.settling_time, _FAILURE * horizon)
-            cost = cost + goal.effort * runs.effort + goal.jerkiness * runs.voltage_variation
-            rate = jnp.mean(runs.success.astype(cost.dtype))
-            settled = jnp.mean(jnp.where(runs.success, runs.settling_time, 0.0)) / rate  # NaN without a success
-            sliding = jnp.mean(self._over(slides, *some).astype(cost.dtype))
-            slow = jnp.max(jnp.abs(jnp.linalg.eigvals(self._closed_loop(vector)))) <= plan.pole_limit
-            score = jnp.where(slow, jnp.mean(cost) + _FAILURE * horizon * sliding, jnp.inf)
-            return jnp.where(jnp.isnan(score), jnp.inf, score), rate, settled
-
-        lanes = max(1, 512 // count)
-        return jax.lax.map(one, vectors, batch_size=min(lanes, vectors.shape[0]))
+    def _run(self, controller: Hybrid, start: State, plant: CartPole | None, **settings: Any) -> Metrics:
+        plant = self.plant if plant is None else plant
+        found: Metrics = measure(plant, controller, start, metrics=self.fold, **settings)
+        return found
 
     def _over(self, one: Callable[[State, CartPole], Any], starts: State, plants: CartPole | None) -> Any:
         """`one` of every start, on the plant or on a plant of its own."""
         if plants is None:
             return jax.vmap(lambda start: one(start, self.plant))(starts)
         return jax.vmap(one)(starts, plants)
+
+
+def _in_blocks(function: Any, block: int, *trees: Any) -> Any:
+    """`function` of (n, ...) arrays, as NumPy arrays, by blocks of one size, so that it is compiled once."""
+    count = jax.tree.leaves(trees)[0].shape[0]
+    parts = []
+    for begin in range(0, count, block):
+        members = np.minimum(np.arange(begin, begin + block), count - 1)
+        parts.append(jax.tree.map(np.asarray, function(*jax.tree.map(operator.itemgetter(members), trees))))
+    return jax.tree.map(lambda *columns: np.concatenate(columns)[:count], *parts)
 
 
 def _watched(count: int) -> int:

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from cpjax import paper
 from cpjax.errors import InputError
 from cpjax.tune.parameters import free_parameters
-from cpjax.tune.plan import Plan
+from cpjax.tune.plan import AGGREGATES, Plan
 from cpjax.tune.plants import UNCERTAIN, sample_plants
 from cpjax.tune.starting import beginning
 from cpjax.tune.tuner import _restore, _store, _Tuner, tune
@@ -53,6 +54,46 @@ def test_a_checkpoint_of_another_tuning_is_refused(tuner, tmp_path):
         tune(PLANT, tuner.free, SMALL, checkpoint=path)
 
 
+def test_candidates_are_compared_on_more_and_more_starts_and_the_given_controller_stays(monkeypatch):
+    free = free_parameters(beginning("bland", "placement", PLANT))
+    asked, seen = [], []
+
+    def by_first_parameter(tuner, vectors, count, purpose):
+        asked.append((len(vectors), count))
+        seen.append(vectors[:, 0])
+        return vectors[:, 0], np.ones(len(vectors)), np.ones(len(vectors))
+
+    monkeypatch.setattr(_Tuner, "_score", by_first_parameter)
+    plan = dataclasses.replace(SMALL, candidates=255, restarts=2, screening=1)
+    memory = _Tuner(PLANT, free, plan).begin()
+    assert asked == [(256, 1), (64, 4), (16, 16), (2, SMALL.validation)]
+    np.testing.assert_array_equal(memory.vectors[0], np.asarray(free.start()))
+    assert memory.vectors[1, 0] == np.min(seen[0][1:])
+    steps = sum(len_ * count * 375 + len_ * count * (100 + SMALL.spare_steps) for len_, count in asked)
+    assert memory.value_steps == steps
+
+
+@pytest.mark.slow
+def test_a_law_whose_crossings_cannot_be_located_scores_as_one_that_fails():
+    free = free_parameters(beginning("bland", "placement", PLANT))
+    scores = {}
+    for spare in (0, 64):
+        tuner = _Tuner(PLANT, free, dataclasses.replace(SMALL, spare_steps=spare, horizon=8.0))
+        found, rates, _ = tuner._score(np.asarray(free.start())[None], 4, 1)
+        assert rates[0] == 1.0
+        scores[spare] = found[0]
+    assert scores[64] < 8.0
+    assert scores[0] == pytest.approx(scores[64] + 3.0 * 8.0)
+
+
+@pytest.mark.parametrize("aggregate", AGGREGATES)
+def test_a_batch_is_aggregated_as_the_plan_says(aggregate):
+    values = jnp.asarray([1.0, 2.0, 6.0])
+    plan = Plan(aggregate=aggregate, tail=0.34, temperature=0.1, threshold=4.0)
+    expected = {"tail": 6.0, "soft-maximum": 6.0 - 0.1 * math.log(3.0), "success-weighted": 1.5}[aggregate]
+    assert float(plan.aggregated(values)) == pytest.approx(expected, abs=1e-6)
+
+
 def test_a_start_that_cannot_be_simulated_does_no_harm(tuner):
     starts, _ = tuner._draw(2, 1, 0)
     bad = dataclasses.replace(starts, theta_dot=jnp.asarray([0.1, jnp.nan]))
@@ -64,7 +105,15 @@ def test_a_start_that_cannot_be_simulated_does_no_harm(tuner):
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("starts", "nowhere"), ("batch", 0), ("learning_rate", -1.0), ("dt", 0.3), ("plant_spread", 1.0), ("steps", 1.5)],
+    [
+        ("starts", "nowhere"),
+        ("batch", 0),
+        ("learning_rate", -1.0),
+        ("dt", 0.3),
+        ("plant_spread", 1.0),
+        ("steps", 1.5),
+        ("aggregate", "best"),
+    ],
 )
 def test_a_bad_plan_is_refused(field, value):
     with pytest.raises(InputError):
