@@ -28,6 +28,7 @@ from cpjax.design.riccati import care, dare
 from cpjax.errors import InputError
 from cpjax.io import load, save
 from cpjax.plant import CartPole, LinearModel, Motor, linearize
+from cpjax.presets import preset
 from cpjax.sim.flags import Flag
 from cpjax.sim.gradients import Gradients, gradients
 from cpjax.sim.metrics import Metrics, ProtocolMetrics, TimeOutside
@@ -82,6 +83,7 @@ __all__ = [
     "paper",
     "place",
     "place_polynomial",
+    "preset",
     "rollout",
     "sample_starts",
     "save",

@@ -16,12 +16,12 @@ from _common import run
 
 from cpjax import io, paper
 from cpjax.plant import CartPole
+from cpjax.presets import preset
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.rollout import rollout
 from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
 from cpjax.state import NAMES, State
-from cpjax.study.comparison import preset
 
 INTERVALS, HOLD, HOLD_INTERVALS, BAND = 80, 1.0, 20, 0.05
 

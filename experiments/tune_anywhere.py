@@ -13,9 +13,9 @@ from _common import run
 from _tuned import QUICK, tuned, use_fast_gradients
 
 from cpjax import io, paper
+from cpjax.presets import preset
 from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
-from cpjax.study.comparison import preset
 from cpjax.study.summary import summarise
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan

@@ -21,11 +21,11 @@ from cpjax import io, paper
 from cpjax.controllers import Hybrid
 from cpjax.numeric.statistics import wilson_interval
 from cpjax.plant import CartPole
+from cpjax.presets import preset
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.rollout import measure
 from cpjax.starts import sample_starts
 from cpjax.state import State
-from cpjax.study.comparison import preset
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
 from cpjax.tune.plants import UNCERTAIN, sample_plants

@@ -22,6 +22,7 @@ ROOMS = [
     "paper",
     "sim",
     "io",
+    "presets",
     "bridges",
     "tune",
     "study",

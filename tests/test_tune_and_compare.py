@@ -8,7 +8,9 @@ import pytest
 import cpjax
 from cpjax import io, paper
 from cpjax.controllers import LqrWeights, PoleFactors
-from cpjax.study.comparison import DESIGNS, best, compare, entries, preset
+from cpjax.errors import InputError
+from cpjax.presets import preset
+from cpjax.study.comparison import DESIGNS, best, compare, entries
 from cpjax.study.reproduction import Setting
 from cpjax.tune import tuner
 from cpjax.tune.tuner import Tuning
@@ -71,6 +73,17 @@ def test_tune_names_what_is_wrong(arguments, words, tmp_path, command):
     assert done.code == 2
     assert words in done.err
     assert done.err.count("\n") == 1
+
+
+def test_the_command_line_knows_the_shipped_controllers_by_name(tmp_path, command):
+    done = command("swingup", "--controller", "tuned_place", "--duration", "6", "--dt", "0.01", "--out", tmp_path)
+    assert done.code == 0, done.err
+    assert json.loads((tmp_path / "swingup.json").read_text())["controller"] == io.encode(preset("placement"))
+
+
+def test_a_preset_that_does_not_exist_is_refused():
+    with pytest.raises(InputError, match="one of lqr, placement"):
+        preset("h-infinity")
 
 
 @pytest.mark.parametrize("design", DESIGNS)

@@ -16,7 +16,7 @@ from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.sim.rollout import Trajectory, rollout
 from cpjax.state import NAMES, State
-from cpjax.study.comparison import PRESETS, Compared, best, compare, document, entries
+from cpjax.study.comparison import Compared, best, compare, document, entries
 from cpjax.study.reproduction import DESIGNS, Setting
 
 OPTIONS = [
@@ -108,5 +108,5 @@ def print_results(results: list[Compared]) -> None:
 def _loaded(design: str, path: str) -> Hybrid:
     loaded = io.load(path)
     if not isinstance(loaded, Hybrid):
-        raise InputError(f"tuned-{design}", path, f"a file that holds a Hybrid, such as {PRESETS['lqr']}")
+        raise InputError(f"tuned-{design}", path, "a file that holds a Hybrid")
     return loaded

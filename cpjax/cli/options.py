@@ -30,6 +30,7 @@ from cpjax.design.lqr import lqr
 from cpjax.design.placement import place
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor, linearize
+from cpjax.presets import PRESETS, preset
 from cpjax.pytree import Number, rules
 from cpjax.sim.integrators import INTEGRATORS
 from cpjax.starts import START_SETS, sample_starts
@@ -79,7 +80,12 @@ PLANT_OPTIONS = [
 ]
 
 CONTROLLER_OPTIONS = [
-    Option("controller", "file", "a controller saved by cpjax, instead of all options below", flag="controller"),
+    Option(
+        "controller",
+        "file",
+        "tuned_lqr, tuned_place or a controller saved by cpjax, instead of all options below",
+        flag="controller",
+    ),
     Option("controller", "law", "swing-up law (default corrected-centred)", choices=tuple(paper.LAWS)),
     Option("controller", "design", "regulator (default placement)", choices=("placement", "lqr")),
     Option(
@@ -220,6 +226,9 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
     if file is not None:
         if changes:
             raise InputError("controller", file, "alone, without " + ", ".join(changes))
+        for design, name in PRESETS.items():
+            if file == name:
+                return preset(design)
         try:
             return as_controller(io.load(file))
         except InputError as problem:

@@ -1,7 +1,6 @@
 """Tuned controllers beside the paper's: which of LQR and pole placement is better at 12 V, and at what price?"""
 
 import dataclasses
-import importlib.resources
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from cpjax import io, paper
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
+from cpjax.presets import preset
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
@@ -18,9 +18,6 @@ from cpjax.study.reproduction import DESIGNS, GAINS, Setting
 from cpjax.study.summary import summarise
 
 Report = Callable[[int, int, str], None]
-PRESETS: Mapping[paper.Design, str] = {"lqr": "tuned_lqr.json", "placement": "tuned_place.json"}
-"""The tuned controllers that come with the package."""
-
 LAWS = ("as-printed", "corrected")
 """The paper's two readings, from `cpjax.paper.LAWS`."""
 
@@ -46,13 +43,6 @@ class Compared:
     """Of (n,) arrays."""
     summary: Mapping[str, Any]
     """See `summarise`."""
-
-
-def preset(design: paper.Design) -> Hybrid:
-    """The tuned controller that comes with the package, for the appendix's plant."""
-    with importlib.resources.as_file(importlib.resources.files("cpjax") / "presets" / PRESETS[design]) as path:
-        loaded: Hybrid = io.load(path)
-    return loaded
 
 
 def entries(plant: CartPole, tuned: Mapping[paper.Design, Hybrid] | None = None) -> list[Entry]:
