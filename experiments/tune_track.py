@@ -25,7 +25,7 @@ from cpjax.tune.starting import beginning
 
 EVALUATION_SEED = 20_000
 LIMITS = (0.8, 0.6, 0.5)
-PLAN: dict[str, Any] = {"duration": 6.0, "horizon": 8.0, "horizon_dt": 0.01, "spare_steps": 64}
+PLAN: dict[str, Any] = {"duration": 6.0, "horizon": 10.0, "horizon_dt": 0.01}
 
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
@@ -36,7 +36,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     for limit, design in itertools.islice(itertools.product(LIMITS, get_args(paper.Design)), 1 if quick else None):
         goal = Goal(track=3.0, track_limit=limit)
         plan = Plan(seed=seed, goal=goal, **PLAN, **(QUICK if quick else {}))
-        free = free_parameters(beginning("bland", design, plant))
+        free = free_parameters(beginning("bland", design, plant, "lyapunov"))
         controller, made = tuned(out, f"{limit:g}m-{design}-{seed}", plant, free, plan)
         fold = ProtocolMetrics(track_limit=limit)
         found = summarise(sweep(plant, controller, starts, duration=10.0, dt=0.002, clock="sampled", metrics=fold))

@@ -3,7 +3,7 @@
 import argparse
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from cpjax.starts import START_SETS
 from cpjax.tune.objective import Goal
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import AGGREGATES, Plan
-from cpjax.tune.starting import beginning
+from cpjax.tune.starting import GateKind, beginning
 
 _DEFAULTS = {field.name: field.default for field in dataclasses.fields(Plan)}
 _PLANNED = {
@@ -41,6 +41,7 @@ OPTIONS = [
     *PLANT_OPTIONS,
     Option("tune", "design", "of the regulator (default lqr)", choices=("lqr", "placement")),
     Option("tune", "start_from", "bland, paper, or a file with a controller that knows its design (default bland)"),
+    Option("tune", "gate", "of bland and paper (default angle-rate)", choices=get_args(GateKind)),
     Option("tune", "frozen", "parameters to leave as they are, with commas between"),
     Option("tune", "free", "the only parameters to change, with commas between"),
     Option("tune", "full_q", "a full state weight (default diagonal)", choices=("full", "diagonal"), flag="q-shape"),
@@ -74,7 +75,7 @@ def run(given: argparse.Namespace) -> int:
     plant = build_plant(sections["plant"])
     setting = dict(sections["tune"])
     design: paper.Design = setting.pop("design", "lqr")
-    controller = _begin(setting.pop("start_from", "bland"), design, plant)
+    controller = _begin(setting.pop("start_from", "bland"), design, plant, setting.pop("gate", None))
     names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}
     free = free_parameters(controller, **names, full_q=setting.pop("full_q", "diagonal") == "full")
     plan = Plan(seed=given.seed, goal=Goal(**sections["goal"]), **setting)
@@ -99,9 +100,11 @@ def run(given: argparse.Namespace) -> int:
     return 0
 
 
-def _begin(name: str, design: paper.Design, plant: Any) -> Hybrid:
+def _begin(name: str, design: paper.Design, plant: Any, gate: str | None) -> Hybrid:
     if Path(name).suffix.lower() not in (".json", ".toml"):
-        return beginning(name, design, plant)
+        return beginning(name, design, plant, gate or "angle-rate")
+    if gate is not None:
+        raise InputError("gate", gate, "absent: the file's controller has one")
     loaded = io.load(name)
     if not isinstance(loaded, Hybrid):
         raise InputError("start_from", name, "a file that holds a Hybrid")

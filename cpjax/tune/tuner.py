@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import io as buffers
 import json
+import math
 import operator
 import time
 from collections.abc import Callable
@@ -165,7 +166,8 @@ class _Tuner:
         plan = self.plan
         given = np.asarray(self.free.start())[None]
         random = np.random.default_rng(_seed(plan, _SCREEN, 1))
-        vectors = np.concatenate([given, self.free.draw(random, plan.candidates).astype(given.dtype)])
+        drawn = self.free.draw(random, plan.candidates, short_track=math.isfinite(plan.goal.track_limit))
+        vectors = np.concatenate([given, drawn.astype(given.dtype)])
         starts, steps = plan.screening, 0
         while True:  # successive halving, by quarters (Jamieson and Talwalkar, 2016)
             scores, _, _ = self._score(vectors, starts, _SCREEN)

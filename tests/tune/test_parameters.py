@@ -9,6 +9,7 @@ import cpjax
 from cpjax import paper
 from cpjax.controllers import AngleRateGate, EnergySwingUp, Hybrid, LqrWeights, LyapunovGate, PoleFactors, StateFeedback
 from cpjax.errors import InputError
+from cpjax.plant import linearize
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.starting import beginning
 from cpjax.tune.tuner import fastest_pole_bound
@@ -113,3 +114,22 @@ def test_the_pole_bound_is_a_bound_and_at_most_eight_times_the_pole():
         bound = float(fastest_pole_bound(jnp.asarray(A)))
         assert fastest * (1 - 1e-9) <= bound <= 8.0 * fastest * (1 + 1e-9)
     assert float(fastest_pole_bound(jnp.diag(jnp.full(4, -3.0)))) == pytest.approx(24.0)
+
+
+def test_a_short_track_is_tried_with_gentler_pumping_too():
+    free = free_parameters(beginning("bland", "lqr", PLANT))
+    random = np.random.default_rng(3)
+    least = {short: np.min(free.draw(random, 4000, short_track=short)[:, 0]) for short in (False, True)}
+    assert free.labels[0] == "energy_gain"
+    assert least[True] - least[False] == pytest.approx(math.log(0.2), abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["bland", "paper"])
+@pytest.mark.parametrize("design", ["lqr", "placement"])
+def test_a_beginning_may_have_the_level_set_of_its_own_design(name, design):
+    made = beginning(name, design, PLANT, "lyapunov")
+    assert free_parameters(made).labels[-1] == "level"
+    found = made.regulator.design.solve(*linearize(PLANT))
+    np.testing.assert_array_equal(made.gate.P, found.P)
+    with pytest.raises(InputError, match="gate"):
+        beginning(name, design, PLANT, "square")
