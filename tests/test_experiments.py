@@ -12,17 +12,21 @@ EXPERIMENTS = sorted(path for path in FOLDER.glob("*.py") if not path.name.start
 
 SLOW = {  # a minute of compiling each, or what the package's own tests hold anyway
     "accuracy",
+    "benchmark_design",
     "gradient_accuracy",
     "gradient_cost",
     "kill_and_resume",
     "recover_parameters",
+    "reference_times",
     "riccati_accuracy",
+    "start_up",
     "success_table",
     "tune_anywhere",
     "tune_baselines",
     "tune_robust",
     "tune_seeds",
     "tune_track",
+    "tuner_cost",
 }
 
 

@@ -161,7 +161,8 @@ def test_arguments_that_do_not_fit_are_refused(time, field, arguments):
     assert caught.value.field == field
 
 
-@pytest.mark.parametrize("time", ["continuous", pytest.param("discrete", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("time", ["continuous", "discrete"])
 def test_derivatives_of_first_and_second_order_agree_with_differences_forward_in_reverse_and_under_vmap(time):
     n, rng = 3, np.random.default_rng(5)
     x = np.stack([np.concatenate([stable(time, n, rng, 0.3).ravel(), rng.normal(size=n * n)]) for _ in range(3)])

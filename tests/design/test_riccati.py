@@ -216,6 +216,7 @@ def is_stable(time, A, B, K):
         return all(mode.real < 0 if time == "continuous" else abs(mode) < 1 for mode in modes)
 
 
+@pytest.mark.slow
 @both
 def test_a_mode_that_rounding_hides_is_refused_or_the_rounded_problem_is_solved(time):
     # Rounding may give a mode a weight, and may move one on the edge inside; it never gives a mode an input.
@@ -394,7 +395,7 @@ def steps(time, problem):
 @pytest.mark.parametrize(
     ("time", "n", "m"),
     [
-        ("continuous", 4, 1),
+        pytest.param("continuous", 4, 1, marks=pytest.mark.slow),
         pytest.param("continuous", 5, 2, marks=pytest.mark.slow),
         pytest.param("discrete", 3, 2, marks=pytest.mark.slow),
         pytest.param("discrete", 4, 1, marks=pytest.mark.slow),

@@ -38,6 +38,7 @@ def beyond_ten_times_scipys(systems, equation, chosen):
     return lost
 
 
+@pytest.mark.slow
 @both
 def test_on_few_systems_the_error_is_at_most_ten_times_scipys(systems, equation):
     special = [system for system in systems.special_systems(equation) if system.B.shape == (4, 1)]

@@ -169,6 +169,7 @@ def errors_by_step(continuous):
 
 
 # A switch falls anywhere within a step, so the error of one start jumps about as the step shrinks; the mean does less.
+@pytest.mark.slow
 def test_switching_per_step_is_of_first_order(errors_by_step):
     steps, before, after = errors_by_step
     assert fitted_order(steps, after.mean(axis=1)) == pytest.approx(1.0, abs=0.1)

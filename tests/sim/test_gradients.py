@@ -23,6 +23,7 @@ def parameters():
     return {"energy_gain": jnp.asarray(5.0), "cart": jnp.asarray([2.0, 4.0])}
 
 
+@pytest.mark.slow
 def test_forward_and_reverse_in_any_chunks_are_the_gradients_of_each_start():
     found = gradients(outside, parameters(), STARTS)
     assert found.value.shape == (7,)

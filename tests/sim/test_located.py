@@ -98,6 +98,7 @@ def test_the_metrics_see_what_happens_inside_the_steps():
     assert coarse.switches == fine.switches == 1
 
 
+@pytest.mark.slow
 def test_what_is_kept_of_the_samples_changes_nothing_else():
     whole, some = (located(PLANT, SOFT, NEAR, save_every=n) for n in (1, 40))
     np.testing.assert_array_equal(some.state.vector(), whole.state.vector()[::40])
@@ -315,6 +316,7 @@ def test_reverse_mode_is_the_finite_difference_for_parameters_of_every_kind(deri
         assert np.all(np.abs(scaled) <= 1e-6 * np.maximum(np.abs(size), 1e-3 * np.max(np.abs(size))))
 
 
+@pytest.mark.slow
 def test_forward_mode_and_segments_and_one_start_alone_give_the_same(derivatives):
     x, reverse = derivatives
     forward = jax.jit(jax.vmap(jax.jacfwd(cost)))(x)
@@ -356,7 +358,10 @@ def ugly_starts():
     yield "across the turn", (0.0, 0.0, math.pi, 1.0)
 
 
-@pytest.mark.parametrize(("dtype", "gate"), [(jnp.float64, "angle with hysteresis"), (jnp.float32, "level set")])
+@pytest.mark.parametrize(
+    ("dtype", "gate"),
+    [pytest.param(jnp.float64, "angle with hysteresis", marks=pytest.mark.slow), (jnp.float32, "level set")],
+)
 def test_no_value_and_no_gradient_is_nan_at_the_ugly_points(dtype, gate):
     starts = jnp.asarray([start for _, start in ugly_starts()], dtype=dtype)
     controller = loop(gate)
@@ -426,7 +431,8 @@ def check_random_draws(count, dtype, chunk):
     assert np.mean(lost != 0) <= 0.01
 
 
-@pytest.mark.parametrize("dtype", [pytest.param(jnp.float64, marks=pytest.mark.slow), jnp.float32])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_no_value_and_no_gradient_is_nan_at_random_points(dtype):
     check_random_draws(500, dtype, chunk=500)
 

@@ -225,7 +225,8 @@ def test_chattering_across_a_gate_is_flagged_and_hysteresis_ends_it():
     assert 0 < int(calm.metrics.switches) < int(sliding.metrics.switches) / 3
 
 
-@pytest.mark.parametrize("clock", [pytest.param("sampled", marks=pytest.mark.slow), "continuous"])
+@pytest.mark.slow
+@pytest.mark.parametrize("clock", ["sampled", "continuous"])
 def test_a_smooth_rollouts_derivative_agrees_forward_in_reverse_and_with_differences(clock):
     """One second of swing-up before the gate, in each law parameter and each start component."""
     settings = {"duration": 0.6, "dt": 0.005, "clock": clock}

@@ -71,6 +71,7 @@ def check(group, count, seed, at_least):
     return gates
 
 
+@pytest.mark.slow
 def test_through_a_catch_with_clip_the_derivatives_are_those_of_the_variational_equation():
     check(GROUPS[3], 2, seed=11, at_least=2)
 

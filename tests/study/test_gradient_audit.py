@@ -41,6 +41,7 @@ def audit():
     return found
 
 
+@pytest.mark.slow
 def test_the_located_derivatives_are_the_differences_and_the_others_are_not(audit):
     assert audit.names == tuple(PARAMETERS)
     assert audit.located.shape == (2, 4, 4)
@@ -56,6 +57,7 @@ def test_the_located_derivatives_are_the_differences_and_the_others_are_not(audi
     assert 1e-3 <= np.median(audit.errors(audit.smooth[0])[:, -1]) <= 1.0
 
 
+@pytest.mark.slow
 def test_before_the_first_crossing_the_objective_knows_nothing_of_the_gate(audit):
     assert np.all(audit.crossings[:, 0] == 0)
     assert np.all(audit.located[:, 0, 2] == 0.0)
@@ -64,6 +66,7 @@ def test_before_the_first_crossing_the_objective_knows_nothing_of_the_gate(audit
     assert np.all(np.diff(audit.value, axis=1) > 0.0)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_relative_changes_and_the_growth_that_of_the_flow(audit):
     def value(energy_gain, start):
         plant, law = build({name: jnp.asarray(v) for name, v in (PARAMETERS | {"energy_gain": energy_gain}).items()})
@@ -83,6 +86,7 @@ def test_derivatives_are_those_of_relative_changes_and_the_growth_that_of_the_fl
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_each_start_may_have_its_own_parameters(audit):
     each = {name: np.array([value, value * 1.01]) for name, value in PARAMETERS.items()}
     found = audit_gradients(build, each, STARTS, **SHORT, temperatures=(), each=True)
@@ -90,6 +94,7 @@ def test_each_start_may_have_its_own_parameters(audit):
     assert np.max(np.abs(found.value[1] - audit.value[1])) > 1e-6
 
 
+@pytest.mark.slow
 def test_verdicts_name_what_is_wrong_with_a_start(audit):
     n = 5
     changed = {
@@ -115,6 +120,7 @@ def test_verdicts_name_what_is_wrong_with_a_start(audit):
     assert made.trusted.tolist() == [True, False, False, False, True]
 
 
+@pytest.mark.slow
 def test_table_picture_sentences_and_document_have_what_was_found(audit):
     lines = cells(audit)
     assert [line[0] for line in lines] == list(audit.names)
@@ -205,6 +211,7 @@ def check_command(done, folder):
     assert len(told["names"]) == np.shape(told["located"])[2]
 
 
+@pytest.mark.slow
 def test_the_command_prints_its_table_and_writes_picture_and_json(command, tmp_path, monkeypatch, audit):
     calls = []
 
