@@ -31,7 +31,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     starts = sample_starts("anywhere", 64 if quick else 10_000, seed=EVALUATION_SEED)
     rows = []
     for design in get_args(paper.Design)[: 1 if quick else None]:
-        plan = Plan(seed=seed, **PLAN, **(QUICK if quick else {}))
+        plan = Plan(seed=seed, **(PLAN | (QUICK if quick else {})))
         free = free_parameters(beginning("bland", design, plant))
         aimed, made = tuned(out, f"{design}-{seed}", plant, free, plan)
         for name, controller in (("hanging", preset(design)), ("anywhere", aimed)):

@@ -3,7 +3,9 @@
     python experiments/tune_track.py
 
 Both designs, tracks of +-0.8, +-0.6 and +-0.5 m, 10,000 `hanging` starts that no tuning has seen. A run is 10 s long
-and has to be settled for its last second. A finished tuning is kept in the folder and not done again.
+and has to be settled for its last second. The gate is a level set of the design's own s' P s. Of three seeds the tuning
+that scored best by its own last comparison counts. The last track's tunings begin with the controller for the longer
+one before it. A finished tuning is kept in the folder and not done again.
 """
 
 import itertools
@@ -25,7 +27,15 @@ from cpjax.tune.starting import beginning
 
 EVALUATION_SEED = 20_000
 LIMITS = (0.8, 0.6, 0.5)
-PLAN: dict[str, Any] = {"duration": 6.0, "horizon": 10.0, "horizon_dt": 0.01}
+FREELY: dict[str, Any] = {"duration": 6.0, "horizon": 10.0, "horizon_dt": 0.01}
+FURTHER: dict[str, Any] = FREELY | {
+    "candidates": 31,
+    "duration": 7.0,
+    "explore": 0.3,
+    "steps": 160,
+    "validation": 256,
+}
+"""Random controllers hardly ever succeed on the shortest track."""
 
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
@@ -33,21 +43,31 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     plant = paper.appendix_plant()
     starts = sample_starts("hanging", 64 if quick else 10_000, seed=EVALUATION_SEED)
     rows = []
-    for limit, design in itertools.islice(itertools.product(LIMITS, get_args(paper.Design)), 1 if quick else None):
+    cases = itertools.product(get_args(paper.Design), LIMITS)
+    controller = beginning("bland", "placement", plant, "lyapunov")
+    for design, limit in itertools.islice(cases, 1 if quick else None):
+        further = limit == LIMITS[-1]
+        if not further:
+            controller = beginning("bland", design, plant, "lyapunov")
+        free = free_parameters(controller)
         goal = Goal(track=3.0, track_limit=limit)
-        plan = Plan(seed=seed, goal=goal, **PLAN, **(QUICK if quick else {}))
-        free = free_parameters(beginning("bland", design, plant, "lyapunov"))
-        controller, made = tuned(out, f"{limit:g}m-{design}-{seed}", plant, free, plan)
+        tunings = []
+        for number in range(seed, seed + (1 if quick else 3)):
+            plan = Plan(seed=number, goal=goal, **((FURTHER if further else FREELY) | (QUICK if quick else {})))
+            tunings.append((number, *tuned(out, f"{limit:g}m-{design}-{number}", plant, free, plan)))
+        number, controller, made = min(tunings, key=lambda tuning: float(tuning[2]["score"]))
         fold = ProtocolMetrics(track_limit=limit)
         found = summarise(sweep(plant, controller, starts, duration=10.0, dt=0.002, clock="sampled", metrics=fold))
-        row = {"track_limit": limit, "design": design, "seed": seed, "evaluation": found, "physical": made["physical"]}
-        rows.append(row | {key: made[key] for key in ("labels", "value_steps", "gradient_steps", "seconds")})
+        row = {"track_limit": limit, "design": design, "seed": number, "evaluation": found}
+        row |= {key: made[key] for key in ("labels", "physical", "value_steps", "gradient_steps", "seconds")}
+        rows.append(row | {"scores": [one["score"] for _, _, one in tunings]})
         low, high = found["success_interval"]
         costs = found["over_successes"]
         print(
-            f"+-{limit:g} m  {design:9}  {100 * found['success_rate']:7.3f} % ({100 * low:.3f} to {100 * high:.3f})  "
+            f"+-{limit:g} m  {design:9}  seed {number}  {100 * found['success_rate']:7.3f} % "
+            f"({100 * low:.3f} to {100 * high:.3f})  "
             f"{costs['settling_time']['mean']:.3f} s  travel {costs['cart_travel']['mean']:.3f} m  "
-            f"{made['seconds']:.0f} s",
+            f"scores {', '.join(format(float(one['score']), '.2f') for _, _, one in tunings)}",
             flush=True,
         )
         io.write_json(out / "tune_track.json", {"versions": io.versions(), "rows": rows})
