@@ -26,30 +26,37 @@ from cpjax.tune.plan import Plan
 from cpjax.tune.starting import beginning
 
 EVALUATION_SEED = 20_000
+BUDGETS: dict[str, dict[str, Any]] = {"whole": {}, "thrifty": {"candidates": 2047, "steps": 45}}
+CASES = (
+    ("appendix", "bland", 5, "whole"),
+    ("appendix", "paper", 1, "whole"),
+    ("identified", "bland", 1, "whole"),
+    ("appendix", "bland", 5, "thrifty"),
+)
 
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     """Prints a line for each tuning and writes tune_seeds.json."""
     cases = [
-        (plant, design, begin, seed + k)
-        for plant, begin, count in (("appendix", "bland", 5), ("appendix", "paper", 1), ("identified", "bland", 1))
+        (plant, design, begin, seed + k, budget)
+        for plant, begin, count, budget in CASES
         for design in get_args(paper.Design)
         for k in range(1 if quick else count)
     ]
     rows = []
-    for name, design, begin, number in cases[:1] if quick else cases:
+    for name, design, begin, number, budget in cases[:1] if quick else cases:
         plant = paper.PLANTS[name]()
-        plan = Plan(seed=number, **(QUICK if quick else {}))
+        plan = Plan(seed=number, **(QUICK if quick else BUDGETS[budget]))
         free = free_parameters(beginning(begin, design, plant))
-        case = f"{name}-{design}-{begin}-{number}"
+        case = f"{name}-{design}-{begin}-{number}" + ("" if budget == "whole" else f"-{budget}")
         controller, made = tuned(out, case, plant, free, plan)
         judged = judge(plant, controller, 64 if quick else 10_000)
-        row = {"plant": name, "design": design, "from": begin, "seed": number, **judged}
+        row = {"plant": name, "design": design, "from": begin, "seed": number, "budget": budget, **judged}
         row |= {key: made[key] for key in ("value_steps", "gradient_steps", "seconds")}
         rows.append(row)
         good = row["evaluation"]
         print(
-            f"{case:32} {100 * good['success_rate']:7.3f} %  {good['over_successes']['settling_time']['mean']:.3f} s  "
+            f"{case:35} {100 * good['success_rate']:7.3f} %  {good['over_successes']['settling_time']['mean']:.3f} s  "
             f"rest {'settles' if row['from_rest'] else 'FAILS'}  quarter step {100 * row['quarter_step_rate']:.3f} %  "
             f"located {100 * row['located_rate']:.3f} %  pole x step {row['pole_times_step']:.3f}  "
             f"{row['value_steps'] / 1e6:.1f} M + {row['gradient_steps'] / 1e6:.2f} M steps  {row['seconds']:.0f} s",

@@ -40,7 +40,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     """Prints the speeds and the weights and writes tuner_cost.json."""
     cases = list(itertools.product(get_args(paper.Design), WORK, OPTIONS))
     speeds: dict[Any, list[float]] = {case: [] for case in cases}
-    for _ in range(1 if quick else 3):
+    for _ in range(1 if quick else 2):
         for case in cases[:1] if quick else cases:
             speeds[case].append(_in_a_process(*case, quick=quick))
     rows = [
@@ -96,7 +96,7 @@ def _measure(design: Any, work: str, quick: bool) -> float:
     random = np.random.default_rng(1)
     vectors = jnp.asarray(np.asarray(free.start()) + 0.1 * random.standard_normal((restarts, len(free.labels))))
     times = []
-    for _ in range(2 if quick else 6):
+    for _ in range(2 if quick else 25):
         began = time.perf_counter()
         jax.block_until_ready(of_all(vectors, starts))  # type: ignore[no-untyped-call]  # untyped in JAX
         times.append(time.perf_counter() - began)
