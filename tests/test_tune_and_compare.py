@@ -98,6 +98,7 @@ def test_a_shipped_controller_is_what_its_design_gives_and_swings_up_every_start
     assert np.mean(metrics.settling_time) < 2.55
 
 
+@pytest.mark.slow
 def test_a_comparison_has_the_papers_eight_and_two_tuned_and_ranks_the_tuned_first():
     setting = Setting(count=16, duration=8.0, dt=0.004)
     _, results = compare(PLANT, entries(PLANT), setting)

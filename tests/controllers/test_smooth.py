@@ -56,6 +56,7 @@ def test_the_regulators_share_is_a_half_on_the_boundary_and_whole_far_inside():
     assert float(smooth.voltage(on)) == pytest.approx(float(half), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_smooth_loops_derivatives_agree_with_differences_and_it_goes_where_the_hard_one_goes_as_it_cools():
     start = State(0.03, 0.0, math.pi - 0.25, 0.2)
 

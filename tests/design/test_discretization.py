@@ -233,6 +233,7 @@ POINTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", ["one input", pytest.param("two inputs", marks=pytest.mark.slow)])
 def test_derivatives_agree_forward_in_reverse_with_differences_and_under_vmap(points):
     rng = np.random.default_rng(7)

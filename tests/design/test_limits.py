@@ -278,6 +278,7 @@ FUNCTIONS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_derivatives_agree_forward_in_reverse_with_differences_and_under_vmap(name):
     function, arguments = FUNCTIONS[name]

@@ -179,6 +179,7 @@ def one_weighed_output(m):
     return [x.astype(np.float32).astype(np.float64) for x in problems]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dtype", "m", "tolerance"), [(np.float64, 1, 1e-5), pytest.param(np.float32, 3, 1e-4, marks=pytest.mark.slow)]
 )

@@ -341,6 +341,7 @@ def test_derivatives_are_right_to_eight_digits_where_the_closed_loops_condition_
     assert np.all(errors <= allowed), np.max(errors / allowed)
 
 
+@pytest.mark.slow
 def test_the_papers_gain_has_the_derivatives_that_differences_have_and_vmap_changes_nothing():
     sets = np.stack([POLES, np.full(4, -4.0), [-3.0, -3.0, -5.0, -5.0]])
     x = np.stack([vector(A, B, p) for p in sets])
@@ -370,6 +371,7 @@ def test_the_second_derivatives_are_the_differences_of_the_first():
     assert np.max(np.abs(hessian[-3:, -3:])) <= 1e-10 * np.max(np.abs(hessian))  # K is linear in the coefficients
 
 
+@pytest.mark.slow
 def test_the_gain_moves_smoothly_with_poles_that_meet():
     derivative = jax.jit(jax.vmap(jax.jacfwd(lambda p: place(A, B, p)[0])))
     batched = jax.jit(jax.vmap(lambda p: place(A, B, p)[0]))
@@ -383,6 +385,7 @@ def through_factors(x):
     return place_polynomial(A, B, QuadraticFactors.from_unconstrained(x).polynomial())[0]
 
 
+@pytest.mark.slow
 def test_through_quadratic_factors_the_gain_is_smooth_where_two_real_poles_become_a_complex_pair():
     meeting = QuadraticFactors(*(jnp.asarray(v) for v in ([4.0, 7.0], [4.0, 12.0], np.zeros(0)))).unconstrained()
     np.testing.assert_allclose(QuadraticFactors.from_unconstrained(meeting).poles(), [-2, -3, -2, -4], atol=1e-7)

@@ -229,6 +229,7 @@ def difference_quotient(function, h):
     return (4 * slopes[1] - slopes[0]) / 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", [None, 1.5])
 def test_a_gramians_derivative_agrees_forward_in_reverse_and_with_differences(horizon):
     A, B, _ = map(jnp.asarray, stable_system(4, 1, 1))
@@ -251,6 +252,7 @@ def test_a_gramians_derivative_agrees_forward_in_reverse_and_with_differences(ho
         np.testing.assert_allclose(found[1], alone, rtol=1e-11, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_gramian_grows_with_its_horizon_by_what_flows_in_at_the_end():
     A, B = papers_model()
     moved = expm(A * 0.7) @ B

@@ -164,6 +164,7 @@ class Push:
         return self.strength * jnp.sin(state.theta)
 
 
+@pytest.mark.slow
 def test_two_laws_that_push_each_other_over_the_gate_are_flagged():
     # Beyond a rate the outer law brakes, within it the inner one accelerates: the rate can only stay where it is.
     chattering = Hybrid(Push(-400.0), Push(400.0), AngleRateGate(1.0, 1.0))
@@ -199,6 +200,7 @@ class Elapsed:
         return (*memory, last.flag)
 
 
+@pytest.mark.slow
 def test_with_coarse_steps_time_never_runs_backwards_and_the_supply_is_never_exceeded():
     draws = random_draws(1500, 3, jnp.float64)
 
@@ -358,6 +360,7 @@ def ugly_starts():
     yield "across the turn", (0.0, 0.0, math.pi, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dtype", "gate"),
     [pytest.param(jnp.float64, "angle with hysteresis", marks=pytest.mark.slow), (jnp.float32, "level set")],

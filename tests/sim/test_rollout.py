@@ -249,7 +249,7 @@ def test_a_smooth_rollouts_derivative_agrees_forward_in_reverse_and_with_differe
 
 
 @pytest.mark.parametrize("theta", [math.pi, -math.pi, 0.0, paper.SWITCH_ANGLE])
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)])
 def test_gradients_are_finite_from_the_ugly_starts(theta, dtype):
     """Hanging at rest, at -pi, upright at rest, exactly on the gate."""
 
