@@ -12,6 +12,7 @@ import json
 import math
 import operator
 import time
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,7 +53,7 @@ class Tuning:
       vector: its free parameters, unconstrained (d,).
       labels: their names.
       physical: and themselves, in SI units.
-      score: by which it was chosen: mean settling time [s], a failure counting three horizons, and what else has weight.
+      score: by which it was chosen: mean settling time [s], a failure counting three horizons, and effort and jerkiness.
       success_rate: on the starts of the last comparison.
       settling_time: mean over the successes among them [s].
       history: one record per validation.
@@ -422,7 +423,7 @@ def _restore(path: Path | None, tuner: _Tuner) -> _Memory | None:
         note = json.loads(arrays.pop("note").tobytes())
         blank = tuner.optimiser.init(jnp.asarray(arrays["vectors"]))
         leaves = [jnp.asarray(arrays[f"optimiser_{i}"]) for i in range(len(jax.tree.leaves(blank)))]
-    except (OSError, ValueError, KeyError, EOFError) as problem:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as problem:
         raise InputError("checkpoint", str(path), f"a file written by a tuning, or none ({problem})") from problem
     if note.pop("identity") != tuner.identity:
         allowed = "one of the same tuning (plan, plant, controller, versions); remove it, or choose another folder"
