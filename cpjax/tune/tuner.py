@@ -53,7 +53,7 @@ class Tuning:
       vector: its free parameters, unconstrained (d,).
       labels: their names.
       physical: and themselves, in SI units.
-      score: by which it was chosen: mean settling time [s], a failure counting three horizons; effort and jerkiness too.
+      score: by which it was chosen: mean settling time [s], a failure counting three horizons; weighed effort too.
       success_rate: on the starts of the last comparison.
       settling_time: mean over the successes among them [s].
       history: one record per validation.
