@@ -11,6 +11,9 @@ from cpjax.tune.parameters import FreeParameters
 from cpjax.tune.plan import Plan
 from cpjax.tune.tuner import document, tune
 
+EVALUATION_SEED = 20_000
+"""Of the starts that judge a tuning; no tuning sees them."""
+
 QUICK: dict[str, Any] = {
     "candidates": 4,
     "restarts": 2,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from _common import run
-from _tuned import QUICK, tuned, use_fast_gradients
+from _tuned import EVALUATION_SEED, QUICK, tuned, use_fast_gradients
 
 from cpjax import io, paper
 from cpjax.presets import preset
@@ -21,7 +21,6 @@ from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
 from cpjax.tune.starting import beginning
 
-EVALUATION_SEED = 20_000
 PLAN: dict[str, Any] = {"starts": "anywhere", "duration": 5.0, "horizon": 8.0, "horizon_dt": 0.01}
 
 

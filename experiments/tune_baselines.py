@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _common import run
+from _tuned import EVALUATION_SEED
 from scipy.optimize import minimize
-from tune_seeds import EVALUATION_SEED
 
 from cpjax import io, paper
 from cpjax.sim.rollout import measure

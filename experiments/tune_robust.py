@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _common import run
-from _tuned import QUICK, tuned, use_fast_gradients
+from _tuned import EVALUATION_SEED, QUICK, tuned, use_fast_gradients
 
 from cpjax import io, paper
 from cpjax.controllers import Hybrid
@@ -31,7 +31,6 @@ from cpjax.tune.plan import Plan
 from cpjax.tune.plants import UNCERTAIN, sample_plants
 from cpjax.tune.starting import beginning
 
-EVALUATION_SEED = 20_000
 SPREAD, PER_PLANT = 0.2, 4
 # One plant in ten is hard for any controller, and a share of 128 starts says too little about the others.
 PLAN: dict[str, Any] = {

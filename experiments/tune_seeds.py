@@ -12,7 +12,7 @@ from typing import Any, get_args
 import jax
 import numpy as np
 from _common import run
-from _tuned import QUICK, tuned, use_fast_gradients
+from _tuned import EVALUATION_SEED, QUICK, tuned, use_fast_gradients
 
 from cpjax import io, paper
 from cpjax.controllers import Hybrid, StateFeedback
@@ -25,7 +25,6 @@ from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
 from cpjax.tune.starting import beginning
 
-EVALUATION_SEED = 20_000
 BUDGETS: dict[str, dict[str, Any]] = {"whole": {}, "thrifty": {"candidates": 2047, "steps": 45}}
 CASES = (
     ("appendix", "bland", 5, "whole"),

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from _common import run
-from _tuned import QUICK, tuned, use_fast_gradients
+from _tuned import EVALUATION_SEED, QUICK, tuned, use_fast_gradients
 
 from cpjax import io, paper
 from cpjax.sim.metrics import ProtocolMetrics
@@ -25,7 +25,6 @@ from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
 from cpjax.tune.starting import beginning
 
-EVALUATION_SEED = 20_000
 LIMITS = (0.8, 0.6, 0.5)
 FREELY: dict[str, Any] = {"duration": 6.0, "horizon": 10.0, "horizon_dt": 0.01}
 FURTHER: dict[str, Any] = FREELY | {

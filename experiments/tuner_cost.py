@@ -29,6 +29,7 @@ from cpjax.sim.rollout import measure
 from cpjax.starts import sample_starts
 from cpjax.state import State
 from cpjax.tune.parameters import free_parameters
+from cpjax.tune.plan import Plan
 from cpjax.tune.starting import beginning
 
 FUSION, LOOPS = "xla_cpu_use_multi_output_fusion=true", "xla_cpu_small_while_loop_byte_threshold=16777216"
@@ -87,7 +88,7 @@ def _measure(design: Any, work: str, quick: bool) -> float:
 
     def outside(vector: jax.Array, start: State) -> jax.Array:
         fold = TimeOutside(0.1, 0.1)
-        settings: dict[str, Any] = {"switching": "located", "spare_steps": 32}
+        settings: dict[str, Any] = {"switching": "located", "spare_steps": Plan().spare_steps}
         found: jax.Array = measure(plant, free.build(vector), start, duration=duration, dt=dt, metrics=fold, **settings)
         return found
 
@@ -100,7 +101,7 @@ def _measure(design: Any, work: str, quick: bool) -> float:
         began = time.perf_counter()
         jax.block_until_ready(of_all(vectors, starts))  # type: ignore[no-untyped-call]  # untyped in JAX
         times.append(time.perf_counter() - began)
-    steps = round(duration / dt) + (32 if work == "gradients" else 0)
+    steps = round(duration / dt) + (Plan().spare_steps if work == "gradients" else 0)
     return restarts * jnp.shape(starts.x)[0] * steps / min(times[1:])
 
 

@@ -287,13 +287,13 @@ class _Tuner:
         """Loss and gradient of one restart, with no start's sensitivity drowning the others'."""
         plan = self.plan
 
-        def objective(vector: Vector, start: State, plant: CartPole) -> jax.Array:
+        def objective(vector: Vector, start: State, plant: CartPole | None) -> jax.Array:
+            plant = self.plant if plant is None else plant
             fold = plan.goal.fold(self.free.model, width)
             value: jax.Array = measure(plant, self.free.build(vector), start, **self.located, metrics=fold)
             return value
 
-        value_and_grad = jax.value_and_grad(objective)
-        values, slopes = self._over(lambda start, plant: value_and_grad(vector, start, plant), starts, plants)
+        values, slopes = jax.vmap(functools.partial(jax.value_and_grad(objective), vector))(starts, plants)
         sound = jnp.all(jnp.isfinite(slopes), axis=1) & jnp.isfinite(values)
         slopes = jnp.where(sound[:, None], slopes, 0.0)
         norms = jnp.sqrt(jnp.sum(slopes * slopes, axis=1))
@@ -357,12 +357,6 @@ class _Tuner:
         plant = self.plant if plant is None else plant
         found: Metrics = measure(plant, controller, start, metrics=self.fold, **settings)
         return found
-
-    def _over(self, one: Callable[[State, CartPole], Any], starts: State, plants: CartPole | None) -> Any:
-        """`one` of every start, on the plant or on a plant of its own."""
-        if plants is None:
-            return jax.vmap(lambda start: one(start, self.plant))(starts)
-        return jax.vmap(one)(starts, plants)
 
 
 def _in_blocks(function: Any, block: int, *trees: Any) -> Any:
