@@ -4,7 +4,7 @@
 
 For 64 `hanging` starts: the least time after which |theta| <= 0.05 rad and |x| <= 0.05 m hold for 1 s, with |u| <= 12 V
 and a free track, by Hermite and Simpson's rule and IPOPT (CasADi, the extra "baselines"), the better of two first
-guesses: the runs of the two shipped laws. Locally optimal: the best that was found, not a bound. The shipped laws are put
+guesses: the runs of the two shipped laws. Locally optimal: the best that was found, not a bound. The shipped laws stand
 beside it.
 """
 
