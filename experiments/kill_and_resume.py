@@ -33,7 +33,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
     expected = (out / "whole" / "tuned.json").read_bytes()
     kills: list[dict[str, Any]] = []
     for i in range(1 if quick else 10):
-        folder, moment = out / f"killed-{i}", float(random.uniform(0.1, 0.95) * length)
+        folder, moment = out / f"killed-{i}", float(random.uniform(0.1, 0.8) * length)
         finished = _run(folder, size, out, until=moment)
         saved = (folder / "checkpoint.npz").exists()
         _run(folder, size, out)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from _common import run
-from _tuned import EVALUATION_SEED, QUICK, tuned, use_fast_gradients
+from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned, use_fast_gradients
 
 from cpjax import io, paper
 from cpjax.presets import preset
@@ -35,14 +35,16 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
         aimed, made = tuned(out, f"{design}-{seed}", plant, free, plan)
         for name, controller in (("hanging", preset(design)), ("anywhere", aimed)):
             found = summarise(sweep(plant, controller, starts, duration=20.0, dt=0.002, clock="sampled"))
-            row: dict[str, Any] = {"design": design, "tuned_for": name, "evaluation": found}
+            located, _ = located_rate(plant, controller, starts, duration=20.0)
+            row: dict[str, Any] = {"design": design, "tuned_for": name, "evaluation": found, "located_rate": located}
             if name == "anywhere":
                 row |= {key: made[key] for key in ("labels", "physical", "value_steps", "gradient_steps", "seconds")}
             rows.append(row)
             low, high = found["success_interval"]
             print(
                 f"{design:9}  tuned for {name:8}  {100 * found['success_rate']:7.3f} % "
-                f"({100 * low:.3f} to {100 * high:.3f})  {found['over_successes']['settling_time']['mean']:.3f} s",
+                f"({100 * low:.3f} to {100 * high:.3f})  {found['over_successes']['settling_time']['mean']:.3f} s  "
+                f"located {100 * located:.2f} %",
                 flush=True,
             )
             io.write_json(out / "tune_anywhere.json", {"versions": io.versions(), "seed": seed, "rows": rows})

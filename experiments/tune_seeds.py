@@ -3,20 +3,24 @@
     python experiments/tune_seeds.py
 
 Each tuned law is evaluated as docs/protocol.md says, from exact rest too, at a quarter of the step, and on the
-continuous clock with located switching. A finished tuning is kept in the folder and not done again.
+continuous clock with located switching. A finished tuning is kept in the folder and not done again. Of the five seeds
+from the bland beginning the controller with the best score of its own, on starts of its own, is copied to
+tuned_lqr.json and tuned_place.json: the controllers that ship.
 """
 
+import math
 from pathlib import Path
 from typing import Any, get_args
 
 import jax
 import numpy as np
 from _common import run
-from _tuned import EVALUATION_SEED, QUICK, tuned, use_fast_gradients
+from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned, use_fast_gradients
 
 from cpjax import io, paper
 from cpjax.controllers import Hybrid, StateFeedback
 from cpjax.plant import CartPole, linearize
+from cpjax.presets import PRESETS
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
@@ -25,37 +29,35 @@ from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
 from cpjax.tune.starting import beginning
 
-BUDGETS: dict[str, dict[str, Any]] = {"whole": {}, "thrifty": {"candidates": 2047, "steps": 45}}
-CASES = (
-    ("appendix", "bland", 5, "whole"),
-    ("appendix", "paper", 1, "whole"),
-    ("identified", "bland", 1, "whole"),
-    ("appendix", "bland", 5, "thrifty"),
-)
+CASES = (("appendix", "bland", 5), ("appendix", "paper", 5), ("identified", "bland", 1))
 
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     """Prints a line for each tuning and writes tune_seeds.json."""
     cases = [
-        (plant, design, begin, seed + k, budget)
-        for plant, begin, count, budget in CASES
+        (plant, design, begin, seed + k)
+        for plant, begin, count in CASES
         for design in get_args(paper.Design)
         for k in range(1 if quick else count)
     ]
     rows = []
-    for name, design, begin, number, budget in cases[:1] if quick else cases:
+    best: dict[str, float] = {}
+    for name, design, begin, number in cases[:1] if quick else cases:
         plant = paper.PLANTS[name]()
-        plan = Plan(seed=number, **(QUICK if quick else BUDGETS[budget]))
+        plan = Plan(seed=number, **(QUICK if quick else {}))
         free = free_parameters(beginning(begin, design, plant))
-        case = f"{name}-{design}-{begin}-{number}" + ("" if budget == "whole" else f"-{budget}")
+        case = f"{name}-{design}-{begin}-{number}"
         controller, made = tuned(out, case, plant, free, plan)
         judged = judge(plant, controller, 64 if quick else 10_000)
-        row = {"plant": name, "design": design, "from": begin, "seed": number, "budget": budget, **judged}
-        row |= {key: made[key] for key in ("value_steps", "gradient_steps", "seconds")}
+        row = {"plant": name, "design": design, "from": begin, "seed": number, **judged}
+        row |= {key: made[key] for key in ("score", "value_steps", "gradient_steps", "seconds")}
         rows.append(row)
+        if (name, begin) == CASES[0][:2] and float(made["score"]) < best.get(design, math.inf):
+            best[design] = float(made["score"])
+            io.save(out / PRESETS[design], controller)
         good = row["evaluation"]
         print(
-            f"{case:35} {100 * good['success_rate']:7.3f} %  {good['over_successes']['settling_time']['mean']:.3f} s  "
+            f"{case:29} score {float(row['score']):.3f}  {100 * good['success_rate']:7.3f} %  {good['over_successes']['settling_time']['mean']:.3f} s  "
             f"rest {'settles' if row['from_rest'] else 'FAILS'}  quarter step {100 * row['quarter_step_rate']:.3f} %  "
             f"located {100 * row['located_rate']:.3f} %  pole x step {row['pole_times_step']:.3f}  "
             f"{row['value_steps'] / 1e6:.1f} M + {row['gradient_steps'] / 1e6:.2f} M steps  {row['seconds']:.0f} s",
@@ -73,7 +75,7 @@ def judge(plant: CartPole, controller: Hybrid, count: int) -> dict[str, Any]:
     settled: Metrics = sweep(plant, controller, rest, duration=20.0, dt=0.002, clock="sampled")
     found: Metrics = sweep(plant, controller, starts, duration=20.0, dt=0.002, clock="sampled")
     finer: Metrics = sweep(plant, controller, some, duration=20.0, dt=0.0005, clock="sampled")
-    located: Metrics = sweep(plant, controller, some, duration=20.0, dt=0.002, switching="located")
+    located, located_time = located_rate(plant, controller, starts, duration=20.0)
     regulator = controller.regulator
     assert isinstance(regulator, StateFeedback)
     A, B = linearize(plant)
@@ -83,8 +85,8 @@ def judge(plant: CartPole, controller: Hybrid, count: int) -> dict[str, Any]:
         "from_rest": bool(settled.success[0]),
         "rest_settling_time": float(settled.settling_time[0]),
         "quarter_step_rate": float(np.mean(finer.success)),
-        "located_rate": float(np.mean(located.success)),
-        "located_settling_time": float(np.mean(np.asarray(located.settling_time)[np.asarray(located.success)])),
+        "located_rate": located,
+        "located_settling_time": located_time,
         "pole_times_step": float(np.max(np.abs(poles)) * 0.002),
     }
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from _common import run
-from _tuned import EVALUATION_SEED, QUICK, tuned, use_fast_gradients
+from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned, use_fast_gradients
 
 from cpjax import io, paper
 from cpjax.sim.metrics import ProtocolMetrics
@@ -57,7 +57,8 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
         number, controller, made = min(tunings, key=lambda tuning: float(tuning[2]["score"]))
         fold = ProtocolMetrics(track_limit=limit)
         found = summarise(sweep(plant, controller, starts, duration=10.0, dt=0.002, clock="sampled", metrics=fold))
-        row = {"track_limit": limit, "design": design, "seed": number, "evaluation": found}
+        located, _ = located_rate(plant, controller, starts, duration=10.0, metrics=fold)
+        row = {"track_limit": limit, "design": design, "seed": number, "evaluation": found, "located_rate": located}
         row |= {key: made[key] for key in ("labels", "physical", "value_steps", "gradient_steps", "seconds")}
         rows.append(row | {"scores": [one["score"] for _, _, one in tunings]})
         low, high = found["success_interval"]
@@ -66,7 +67,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
             f"+-{limit:g} m  {design:9}  seed {number}  {100 * found['success_rate']:7.3f} % "
             f"({100 * low:.3f} to {100 * high:.3f})  "
             f"{costs['settling_time']['mean']:.3f} s  travel {costs['cart_travel']['mean']:.3f} m  "
-            f"scores {', '.join(format(float(one['score']), '.2f') for _, _, one in tunings)}",
+            f"located {100 * located:.2f} %  scores {', '.join(format(float(one['score']), '.2f') for _, _, one in tunings)}",
             flush=True,
         )
         io.write_json(out / "tune_track.json", {"versions": io.versions(), "rows": rows})

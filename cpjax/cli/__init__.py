@@ -10,8 +10,8 @@ from cpjax.errors import InputError
 
 EXIT_CODES = """\
 exit codes:
-  0    done (swingup: and the pendulum settled)
-  1    swingup: the rollout ran, but the pendulum did not settle
+  0    done (swingup: and the pendulum settled; tune: from one start at least)
+  1    swingup, tune: done, but the pendulum did not settle
   2    bad input: one line on standard error names the field, the value and what is allowed
   130  interrupted
 """

@@ -11,7 +11,7 @@ from cpjax import io, paper
 from cpjax.cli.options import EVALUATION_OPTIONS, PLANT_OPTIONS, Option, add_options, build_plant, resolve
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
-from cpjax.controllers import Hybrid
+from cpjax.controllers import Hybrid, LqrWeights, PoleFactors
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.sim.rollout import Trajectory, rollout
@@ -109,4 +109,8 @@ def _loaded(design: str, path: str) -> Hybrid:
     loaded = io.load(path)
     if not isinstance(loaded, Hybrid):
         raise InputError(f"tuned-{design}", path, "a file that holds a Hybrid")
+    wanted = LqrWeights if design == "lqr" else PoleFactors
+    found = getattr(loaded.regulator, "design", None)
+    if found is not None and not isinstance(found, wanted):
+        raise InputError(f"tuned-{design}", path, f"a file whose regulator has the design {wanted.__name__}, or none")
     return loaded

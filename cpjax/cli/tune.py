@@ -30,10 +30,20 @@ _PLANNED = {
     "dt": "their step [s]",
     "first_width": "of the target, at first [rad and m]",
     "last_width": "of the target, in the end [rad and m]",
+    "spare_rate": "steps beyond those in each second, for crossings [1/s]",
     "temperature": "of a soft maximum or a success-weighted mean [s]",
     "threshold": "of a success-weighted mean [s]",
     "tail": "share of the worst starts that the mean is taken over",
     "explore": "noise when the worse half of the restarts goes on from the better",
+    "clip": "a start's gradient is shortened to this many times the batch's median norm",
+    "screening": "starts by which all candidates are compared",
+    "validation": "starts of a validation",
+    "validate_every": "steps between validations",
+    "horizon": "of screening and validation [s]",
+    "horizon_dt": "their step and control period [s]",
+    "finalists": "restarts that are compared once more in the end",
+    "final": "starts of that comparison",
+    "pole_limit": "bound on the fastest closed-loop pole [1/s]",
     "patience": "validations without progress after which to end; 0 for never",
     "plant_spread": "draw each start's plant within this share about the given one",
 }
@@ -74,15 +84,15 @@ def run(given: argparse.Namespace) -> int:
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     setting = dict(sections["tune"])
-    design: paper.Design = setting.pop("design", "lqr")
-    controller = _begin(setting.pop("start_from", "bland"), design, plant, setting.pop("gate", None))
+    chosen = {key: setting.pop(key) for key in ("design", "gate") if key in setting}
+    controller = _begin(setting.pop("start_from", "bland"), plant, chosen)
     names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}
     free = free_parameters(controller, **names, full_q=setting.pop("full_q", "diagonal") == "full")
     plan = Plan(seed=given.seed, goal=Goal(**sections["goal"]), **setting)
     with progress("tune") as report:
         tuning = tune(plant, free, plan, progress=report, checkpoint=given.out / "checkpoint.npz")
     io.save(given.out / "tuned.json", tuning.controller)
-    io.write_json(given.out / "tune.json", document(tuning, plant, plan, seed=given.seed))
+    io.write_json(given.out / "tune.json", document(tuning, plant, free, plan))
 
     from cpjax.show.figures import save_figure
     from cpjax.show.tuning import picture
@@ -91,20 +101,21 @@ def run(given: argparse.Namespace) -> int:
     before = np.asarray(free.physical(free.start()))
     rows = [(label, f"{a:.4g}", f"{b:.4g}") for label, a, b in zip(tuning.labels, before, tuning.physical, strict=True)]
     print_table("Parameters, SI units", ("parameter", "start", "tuned"), rows, text_columns=1)
+    after = f", after {tuning.settling_time:.3f} s on average" if tuning.success_rate > 0.0 else ""
     print(
-        f"{100 * tuning.success_rate:.2f} % of {plan.final} starts settle, after {tuning.settling_time:.3f} s on "
-        f"average; {tuning.value_steps / 1e6:.1f} M steps of values, {tuning.gradient_steps / 1e6:.2f} M of gradients, "
+        f"{100 * tuning.success_rate:.2f} % of {plan.final} starts settle{after}; {tuning.value_steps / 1e6:.1f} M steps of values, {tuning.gradient_steps / 1e6:.2f} M of gradients, "
         f"{tuning.seconds:.0f} s"
     )
     print(f"wrote {given.out / 'tuned.json'}, tune.json and tune.png")
-    return 0
+    (given.out / "checkpoint.npz").unlink(missing_ok=True)
+    return 0 if tuning.success_rate > 0.0 else 1
 
 
-def _begin(name: str, design: paper.Design, plant: Any, gate: str | None) -> Hybrid:
+def _begin(name: str, plant: Any, chosen: dict[str, Any]) -> Hybrid:
     if Path(name).suffix.lower() not in (".json", ".toml"):
-        return beginning(name, design, plant, gate or "angle-rate")
-    if gate is not None:
-        raise InputError("gate", gate, "absent: the file's controller has one")
+        return beginning(name, chosen.pop("design", "lqr"), plant, **chosen)
+    for field, value in chosen.items():
+        raise InputError(field, value, "absent: the file's controller has one")
     loaded = io.load(name)
     if not isinstance(loaded, Hybrid):
         raise InputError("start_from", name, "a file that holds a Hybrid")

@@ -20,7 +20,7 @@ def picture(tuning: Tuning) -> Figure:
     above, below = figure.subplots(2, 1, sharex=True)
     for axes, values in ((above, times), (below, rates)):
         axes.plot(steps, values, ".", color=_OTHERS, markersize=5)
-        axes.plot(steps, values[rows, best], "o-", color=_BEST, markersize=5, label="best restart so far in score")
+        axes.plot(steps, values[rows, best], "o-", color=_BEST, markersize=5, label="best of this validation by score")
         axes.grid(alpha=0.3)
     above.set_ylabel("mean settling time [s]")
     below.set_ylabel("successful starts [%]")

@@ -118,6 +118,22 @@ class TerminalCost:
 
 
 @pytree
+class Unfinished:
+    """The time that a stopped run left undone [s]: counted as badly spent, so that nothing is gained by being stopped."""
+
+    duration: Scalar = number("s", "of the whole run", above=0.0)
+
+    def init(self, sample: Sample) -> jax.Array:
+        return jnp.zeros_like(sample.time)
+
+    def update(self, memory: jax.Array, sample: Sample) -> jax.Array:
+        return memory + sample.elapsed
+
+    def finish(self, memory: jax.Array, last: Sample) -> jax.Array:
+        return self.duration - memory
+
+
+@pytree
 class WeightedSum:
     """Several folds at once, and the sum of their results, each times its weight."""
 
@@ -153,10 +169,16 @@ class Goal:
     def __post_init__(self) -> None:
         if (float(self.track) > 0.0) != math.isfinite(float(self.track_limit)):
             raise InputError("Goal.track", self.track, "above 0 if and only if track_limit is finite")
+        if not any(float(getattr(self, name)) > 0.0 for name in WEIGHTS):
+            raise InputError("Goal", self, "with at least one weight above 0")
 
-    def fold(self, plant: CartPole, width: Scalar) -> Fold:
-        """The objective, with a target of this width [rad and m]."""
-        limit = float(self.track_limit)
+    def fold(self, plant: CartPole, width: Scalar, duration: float) -> Fold:
+        """The objective of runs of this duration [s], with a target of this width [rad and m].
+
+        Where a run is stopped, by a flag, the rest of it counts as outside the target, beyond the track, at the wrong
+        energy and at full voltage.
+        """
+        limit, supply = float(self.track_limit), float(plant.motor.voltage_limit)
         makers: Mapping[str, Callable[[], Fold]] = {
             "time": lambda: TimeOutside(width, width),
             "effort": Effort,
@@ -165,10 +187,15 @@ class Goal:
             "energy": lambda: EnergyError(plant),
             "terminal": lambda: TerminalCost(width, width),
         }
-        chosen = [name for name in makers if float(getattr(self, name)) > 0.0]
-        if not chosen:
-            raise InputError("Goal", self, "with at least one weight above 0")
-        return WeightedSum(tuple(makers[n]() for n in chosen), tuple(float(getattr(self, n)) for n in chosen))
+        chosen = [name for name in WEIGHTS if float(getattr(self, name)) > 0.0]
+        worst = float(self.time) + float(self.track) + float(self.energy)
+        worst += float(self.effort) * supply * supply if math.isfinite(supply) else 0.0
+        terms = (*(makers[name]() for name in chosen), Unfinished(duration))
+        return WeightedSum(terms, (*(float(getattr(self, name)) for name in chosen), worst))
+
+
+WEIGHTS = ("time", "effort", "track", "jerkiness", "energy", "terminal")
+"""The weights that a `Goal` has."""
 
 
 Aggregate: TypeAlias = Callable[[jax.Array], jax.Array]

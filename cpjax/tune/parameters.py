@@ -74,9 +74,11 @@ class FreeParameters:
             if slot.kind == "full":
                 value = _from_full(np.asarray(_weights(self.controller).Q, dtype=np.float64))
             elif slot.kind == "log":
-                value = np.log(np.maximum(value, _LEAST * slot.high))
+                unit = _scales(self.controller) if slot.name == "Q" else 1.0
+                value = np.log(np.where(value > 0.0, value, _LEAST * slot.high * unit))
             elif slot.kind == "logit":
-                share = np.clip(value / self._top(slot.name), 1e-6, 1.0 - 1e-6)
+                low, high = self._ends(slot, _first(self.controller, "hysteresis"))
+                share = np.clip((value - low) / (high - low), 1e-6, 1.0 - 1e-6)
                 value = np.log(share) - np.log1p(-share)
             parts.append(value)
         return jnp.asarray(np.concatenate(parts), dtype=jnp.result_type(float))
@@ -119,14 +121,13 @@ class FreeParameters:
                 low = 0.2 * low
             for i in range(slot.size):
                 if slot.kind == "logit":
-                    top = self._top(slot.name)
-                    share = random.uniform(low, min(high, 0.98 * top), count) / top
+                    bottom, top = self._ends(slot, _first(self.controller, "hysteresis"))
+                    share = (random.uniform(low, min(high, 0.98 * top), count) - bottom) / (top - bottom)
                     columns.append(np.log(share) - np.log1p(-share))
                 elif slot.kind == "full" and i >= 4:
                     columns.append(random.uniform(-0.5, 0.5, count))
                 elif slot.name == "Q":
-                    scale = _natural(self.controller).weights[i] * float(_weights(self.controller).R)
-                    drawn = math.log(scale) + random.uniform(math.log(low), math.log(high), count)
+                    drawn = math.log(_scales(self.controller)[i]) + random.uniform(math.log(low), math.log(high), count)
                     columns.append(0.5 * drawn if slot.kind == "full" else drawn)
                 elif slot.kind == "log":
                     columns.append(random.uniform(math.log(low), math.log(high), count))
@@ -139,15 +140,18 @@ class FreeParameters:
         if slot.kind == "log":
             return jnp.exp(x)
         if slot.kind == "logit":
-            return self._top(slot.name) * jax.nn.sigmoid(x)
+            hysteresis = next((self._value(s, vector)[0] for s in self.slots if s.name == "hysteresis"), None)
+            low, high = self._ends(slot, _first(self.controller, "hysteresis") if hysteresis is None else hysteresis)
+            return low + (high - low) * jax.nn.sigmoid(x)
         return _full(x) if slot.kind == "full" else x
 
-    def _top(self, name: str) -> float:
-        """The upper end of a parameter between zero and something."""
-        if name == "half_angle":  # the way out must not be wider than a half turn
-            gate: Any = self.controller.gate  # one of those that have such an angle
-            return math.pi / (1.0 + float(gate.hysteresis))
-        return math.pi / 2
+    def _ends(self, slot: _Slot, hysteresis: Any) -> tuple[float, Any]:
+        """Between what a parameter with two ends lies."""
+        if slot.name == "half_angle":  # the way out must not be wider than a half turn
+            return 0.0, math.pi / (1.0 + hysteresis)
+        rule = rules(EnergySwingUp)[slot.name]
+        assert isinstance(rule, Number)
+        return rule.at_least, rule.at_most
 
 
 def free_parameters(
@@ -162,7 +166,8 @@ def free_parameters(
       full_q: a full state weight instead of a diagonal one.
 
     Raises:
-      InputError: another kind of controller, or a name that it does not have.
+      InputError: another kind of controller, a name that it does not have, or `full_q` where no Q is free, or a Q that
+        is not diagonal without it.
     """
     if not isinstance(controller, Hybrid) or not isinstance(controller.swing_up, EnergySwingUp):
         raise InputError("controller", controller, "a cpjax.Hybrid with a cpjax.EnergySwingUp")
@@ -180,6 +185,12 @@ def free_parameters(
     chosen = [name for name in places if (name not in FROZEN if free is None else name in free) and name not in frozen]
     if not chosen:
         raise InputError("free", free, "at least one name that is not frozen")
+    if full_q and "Q" not in chosen:
+        raise InputError("full_q", full_q, "False: there is no Q among the free parameters")
+    if "Q" in chosen and not full_q:
+        Q = np.asarray(_weights(controller).Q)
+        if np.any(Q != np.diag(np.diagonal(Q))):
+            raise InputError("full_q", full_q, "True: the controller's Q is not diagonal")
     sizes = {"Q": 10 if full_q else 4, "a": 2, "b": 2}
     slots, begin = [], 0
     for name in chosen:
@@ -256,6 +267,16 @@ def _weights(controller: Hybrid) -> LqrWeights:
     assert isinstance(regulator, StateFeedback)
     assert isinstance(regulator.design, LqrWeights)
     return regulator.design
+
+
+def _scales(controller: Hybrid) -> np.ndarray[Any, Any]:
+    """What the elements of Q's diagonal are measured by (4,)."""
+    return np.asarray(_natural(controller).weights) * float(_weights(controller).R)
+
+
+def _first(controller: Hybrid, name: str) -> float:
+    """The gate's own value of a parameter, 0 where it has none."""
+    return float(getattr(controller.gate, name, 0.0))
 
 
 def _read(controller: Hybrid, slot: _Slot) -> Any:

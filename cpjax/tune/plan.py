@@ -32,7 +32,7 @@ class Plan:
       learning_rate: Adam's, at first; it falls to a twentieth along a cosine.
       duration: of the tuning's rollouts [s].
       dt: their step [s].
-      spare_steps: theirs, for crossings; a run that needs more counts up to there.
+      spare_rate: steps beyond those, for crossings, in each second [1/s]; the rest of a run that needs more is lost time.
       first_width: the target's at first [rad and m].
       last_width: and after six tenths of the steps, reached geometrically.
       aggregate: what makes one number of a batch: the mean over a `tail`, a soft maximum or a success-weighted mean.
@@ -66,7 +66,7 @@ class Plan:
     learning_rate: float = 0.05
     duration: float = 4.0
     dt: float = 0.02
-    spare_steps: int = 64
+    spare_rate: float = 16.0
     first_width: float = 0.2
     last_width: float = 0.03
     aggregate: str = "tail"
@@ -99,15 +99,23 @@ class Plan:
                 raise InputError(name, value, f"a whole number, at least {least}")
         for name, rule in _NUMBERS.items():
             object.__setattr__(self, name, rule.normalise(name, getattr(self, name)))
-        check_settings(self.duration, self.dt, "continuous", None, "located", "rk4", None)
-        for horizon, dt in ((self.horizon, self.horizon_dt), (self.final_horizon, self.final_dt)):
-            check_settings(horizon, dt, "sampled", None, "per_step", "rk4", None)
+        for whole, part in (("duration", "dt"), ("horizon", "horizon_dt"), ("final_horizon", "final_dt")):
+            try:
+                check_settings(getattr(self, whole), getattr(self, part), "continuous", None, "per_step", "rk4", None)
+            except InputError as problem:
+                field = part if problem.field == "dt" else whole
+                raise InputError(field, getattr(self, field), problem.allowed) from problem
         if self.restarts > self.candidates + 1:
             raise InputError("restarts", self.restarts, f"at most candidates + 1, {self.candidates + 1}")
 
     def aggregated(self, values: jax.Array) -> jax.Array:
         """One number of the values of a batch (n,)."""
         return _AGGREGATES[self.aggregate](self)(values)
+
+    @property
+    def spare_steps(self) -> int:
+        """Of a rollout with located switching, for crossings."""
+        return math.ceil(self.spare_rate * self.duration)
 
     def width(self, step: int) -> float:
         """The target's at a step [rad and m]."""
@@ -131,7 +139,6 @@ _COUNTS = {
     "seed": 0,
     "candidates": 0,
     "screening": 1,
-    "spare_steps": 0,
     "restarts": 1,
     "batch": 1,
     "steps": 0,
@@ -154,6 +161,7 @@ _NUMBERS = {
     "plant_spread": Number("1", "", at_least=0.0, below=1.0),
     "duration": Number("s", "", above=0.0, at_most=math.inf),
     "dt": Number("s", "", above=0.0),
+    "spare_rate": Number("1/s", "", at_least=0.0),
     "horizon": Number("s", "", above=0.0),
     "final_horizon": Number("s", "", above=0.0),
     "final_dt": Number("s", "", above=0.0),

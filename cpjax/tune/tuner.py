@@ -40,7 +40,7 @@ Numbers = np.ndarray[Any, Any]
 Report = Callable[[int, int, str], None]
 
 _FAILURE = 3.0  # what a start that fails counts, in horizons
-_SCREEN, _STEP, _VALIDATE, _FINAL = range(4)
+_SCREEN, _STEP, _VALIDATE, _FINAL, _CANDIDATES, _NOISE = range(6)  # what random numbers are for
 _BLOCK, _CONTROLLERS = 512, 64  # lanes that are simulated, and controllers that are designed, at once
 
 
@@ -53,7 +53,8 @@ class Tuning:
       vector: its free parameters, unconstrained (d,).
       labels: their names.
       physical: and themselves, in SI units.
-      score: by which it was chosen: mean settling time [s], a failure counting three horizons; weighed effort too.
+      score: by which it was chosen: mean settling time [s], a failure counting three horizons; weighed as in the goal,
+        with its effort and jerkiness.
       success_rate: on the starts of the last comparison.
       settling_time: mean over the successes among them [s].
       history: one record per validation.
@@ -149,14 +150,7 @@ class _Tuner:
         self.validated = self._runs(duration=plan.horizon, dt=plan.horizon_dt, clock="sampled")
         self.evaluated = self._runs(duration=plan.final_horizon, dt=plan.final_dt, clock="sampled")
         self.located_runs = self._runs(**self.located)
-        document = {
-            "plan": plan.table(),
-            "plant": io.encode(plant),
-            "controller": io.encode(free.controller),
-            "free": [slot._asdict() for slot in free.slots],
-            "versions": io.versions(),
-        }
-        self.identity = io.dump_json(document)
+        self.identity = io.dump_json(request(plant, free, plan))
 
     def _runs(self, **settings: Any) -> Any:
         """Metrics of controllers (n,) from starts (n,), each on the plant or on one of its own."""
@@ -166,7 +160,7 @@ class _Tuner:
         """Screens the candidates; the first restart is the given controller."""
         plan = self.plan
         given = np.asarray(self.free.start())[None]
-        random = np.random.default_rng(_seed(plan, _SCREEN, 1))
+        random = np.random.default_rng(_seed(plan, _CANDIDATES, 0))
         drawn = self.free.draw(random, plan.candidates, short_track=math.isfinite(plan.goal.track_limit))
         vectors = np.concatenate([given, drawn.astype(given.dtype)])
         starts, steps = plan.screening, 0
@@ -211,7 +205,7 @@ class _Tuner:
         if half == 0 or plan.explore == 0.0:
             return memory
         losers, winners = order[len(order) - half :], order[:half]
-        random = np.random.default_rng(_seed(plan, _STEP, 2 * memory.step + 1))
+        random = np.random.default_rng(_seed(plan, _NOISE, memory.step))
         size = plan.explore * (1.0 - memory.step / plan.steps)
         noise = size * random.standard_normal((half, memory.best.shape[1]))
         vectors, best, scores = (np.array(x) for x in (memory.vectors, memory.best, memory.scores))
@@ -289,7 +283,7 @@ class _Tuner:
 
         def objective(vector: Vector, start: State, plant: CartPole | None) -> jax.Array:
             plant = self.plant if plant is None else plant
-            fold = plan.goal.fold(self.free.model, width)
+            fold = plan.goal.fold(self.free.model, width, plan.duration)
             value: jax.Array = measure(plant, self.free.build(vector), start, **self.located, metrics=fold)
             return value
 
@@ -303,12 +297,11 @@ class _Tuner:
         worst = jnp.max(jnp.where(sound, values, -jnp.inf))
         values = jnp.where(sound, values, worst)
         loss, shares = jax.value_and_grad(plan.aggregated)(values)
-        slope = jnp.sum((shares * shortened)[:, None] * slopes, axis=0)
-        hurry = jnp.nan_to_num(jax.grad(self._haste)(vector))
-        return loss, slope + hurry
+        slope = jnp.sum((shares * shortened)[:, None] * slopes, axis=0) + jax.grad(self._haste)(vector)
+        return loss, jnp.where(jnp.isfinite(slope), slope, 0.0)  # Adam would remember a NaN for ever
 
     def _haste(self, vector: Vector) -> jax.Array:
-        """Grows once the bound on the fastest closed-loop pole is near its limit."""
+        """Grows once the fastest closed-loop pole is near its limit."""
         excess = jnp.log(fastest_pole_bound(self._closed_loop(vector)) / (0.9 * self.plan.pole_limit))
         return 10.0 * jnp.maximum(excess, 0.0) ** 2
 
@@ -339,9 +332,11 @@ class _Tuner:
         runs = over(self.evaluated if final else self.validated, count)
         # What has more crossings than can be located slides along its gate's boundary, and chatters on a real rig.
         sliding = (over(self.located_runs, _watched(count)).flag & Flag.OVERFLOW) != 0
-        cost = np.where(runs.success, runs.settling_time, _FAILURE * horizon)
+        failure = _FAILURE * horizon * max(1.0, float(goal.time))
+        cost = np.where(runs.success, goal.time * runs.settling_time, failure)
         cost = cost + goal.effort * runs.effort + goal.jerkiness * runs.voltage_variation
-        score = np.mean(cost, axis=1) + _FAILURE * horizon * np.mean(sliding, axis=1)
+        sliding = sliding & runs.success[:, : sliding.shape[1]]  # the others have failed already
+        score = np.mean(cost, axis=1) + failure * np.mean(sliding, axis=1)
         score = np.where(np.isnan(score) | ~(poles <= plan.pole_limit), np.inf, score)
         successes = np.sum(runs.success, axis=1)
         settled = np.sum(np.where(runs.success, runs.settling_time, 0.0), axis=1)
@@ -375,18 +370,18 @@ def _watched(count: int) -> int:
 
 
 def fastest_pole_bound(A: jax.Array) -> jax.Array:
-    """A bound on the largest eigenvalue's magnitude of A (4, 4), at most eight times that: 2 max |c_k|^(1/k) over the
-    coefficients of its characteristic polynomial (Fujiwara, 1916), which are made by Faddeev and LeVerrier's method.
-    Unlike the eigenvalues it has a derivative almost everywhere.
+    """A bound on the largest eigenvalue's magnitude of A (4, 4): |A^64|^(1/64) in the Frobenius norm (Gelfand, 1941).
+
+    Unlike the eigenvalues it has a derivative where some of them meet. It exceeds them by the 64th root of the condition
+    of A's eigenvectors, a tenth or so.
     """
-    identity = jnp.eye(4, dtype=A.dtype)
-    M, bound = identity, jnp.zeros((), A.dtype)
-    for k in range(1, 5):
-        c = -jnp.trace(A @ M) / k
-        M = A @ M + c * identity
-        size = jnp.maximum(jnp.abs(c), float(np.finfo(A.dtype).tiny))
-        bound = jnp.maximum(bound, size ** (1.0 / k))
-    return 2.0 * bound
+    tiny = float(np.finfo(A.dtype).tiny)
+    logarithm = jnp.zeros((), A.dtype)
+    for doubling in range(7):
+        size = jnp.sqrt(jnp.sum(A * A) + tiny)
+        logarithm = logarithm + jnp.log(size) / 2**doubling
+        A = (A / size) @ (A / size)
+    return jnp.exp(logarithm)
 
 
 def _seed(plan: Plan, purpose: int, step: int) -> int:
@@ -427,17 +422,25 @@ def _restore(path: Path | None, tuner: _Tuner) -> _Memory | None:
     return _Memory(optimiser=optimiser, **parts, **note)
 
 
-def document(tuning: Tuning, plant: CartPole, plan: Plan, **others: Any) -> dict[str, Any]:
+def request(plant: CartPole, free: FreeParameters, plan: Plan) -> dict[str, Any]:
+    """What a tuning depends on, as plain values: two of the same request end in the same bits on one machine."""
+    return {
+        "versions": io.versions(),
+        "plan": plan.table(),
+        "plant": io.encode(plant),
+        "start_from": io.encode(free.controller),
+        "free": [slot._asdict() for slot in free.slots],
+    }
+
+
+def document(tuning: Tuning, plant: CartPole, free: FreeParameters, plan: Plan) -> dict[str, Any]:
     """The result for programs; its controller is also a file of its own."""
     fields = {f.name: getattr(tuning, f.name) for f in dataclasses.fields(tuning) if f.name != "controller"}
     low, high = wilson_interval(round(tuning.success_rate * plan.final), plan.final)
     return {
         "what": "a tuning by gradients through swing-ups",
-        "versions": io.versions(),
-        "plan": plan.table(),
-        "plant": io.encode(plant),
+        **request(plant, free, plan),
         "controller": io.encode(tuning.controller),
         "success_interval": [low, high],
         **fields,
-        **others,
     }
