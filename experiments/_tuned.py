@@ -12,7 +12,7 @@ import numpy as np
 from cpjax import io
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
-from cpjax.sim.metrics import Metrics
+from cpjax.sim.metrics import Fold, Metrics
 from cpjax.sim.sweep import sweep
 from cpjax.state import State
 from cpjax.tune.parameters import FreeParameters
@@ -34,12 +34,14 @@ QUICK: dict[str, Any] = {
 """For a `Plan` that only shows that it works."""
 
 
-def located_rate(plant: CartPole, controller: Hybrid, starts: State, **settings: Any) -> tuple[float, float]:
+def located_rate(
+    plant: CartPole, controller: Hybrid, starts: State, duration: float, metrics: Fold | None = None
+) -> tuple[float, float]:
     """Of the first fifth of `starts`, on the continuous clock with located switching: the share that succeeds, and the
     successes' mean settling time [s].
     """
     some = jax.tree.map(lambda column: column[: max(16, len(column) // 5)], starts)
-    found: Metrics = sweep(plant, controller, some, **({"dt": 0.002, "switching": "located"} | settings))
+    found: Metrics = sweep(plant, controller, some, duration=duration, dt=0.002, switching="located", metrics=metrics)
     good = np.asarray(found.success)
     return float(np.mean(good)), float(np.mean(np.asarray(found.settling_time)[good])) if good.any() else math.nan
 

@@ -57,7 +57,8 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
             io.save(out / PRESETS[design], controller)
         good = row["evaluation"]
         print(
-            f"{case:29} score {float(row['score']):.3f}  {100 * good['success_rate']:7.3f} %  {good['over_successes']['settling_time']['mean']:.3f} s  "
+            f"{case:29} score {float(row['score']):.3f}  {100 * good['success_rate']:7.3f} %  "
+            f"{good['over_successes']['settling_time']['mean']:.3f} s  "
             f"rest {'settles' if row['from_rest'] else 'FAILS'}  quarter step {100 * row['quarter_step_rate']:.3f} %  "
             f"located {100 * row['located_rate']:.3f} %  pole x step {row['pole_times_step']:.3f}  "
             f"{row['value_steps'] / 1e6:.1f} M + {row['gradient_steps'] / 1e6:.2f} M steps  {row['seconds']:.0f} s",

@@ -67,7 +67,8 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
             f"+-{limit:g} m  {design:9}  seed {number}  {100 * found['success_rate']:7.3f} % "
             f"({100 * low:.3f} to {100 * high:.3f})  "
             f"{costs['settling_time']['mean']:.3f} s  travel {costs['cart_travel']['mean']:.3f} m  "
-            f"located {100 * located:.2f} %  scores {', '.join(format(float(one['score']), '.2f') for _, _, one in tunings)}",
+            f"located {100 * located:.2f} %  "
+            f"scores {', '.join(format(float(one['score']), '.2f') for _, _, one in tunings)}",
             flush=True,
         )
         io.write_json(out / "tune_track.json", {"versions": io.versions(), "rows": rows})

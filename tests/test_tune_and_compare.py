@@ -27,7 +27,7 @@ def test_tune_writes_a_controller_that_other_commands_take(tmp_path, command):
     tuned = cpjax.load(tmp_path / "tuned.json")
     assert isinstance(tuned.regulator.design, LqrWeights)
     result = json.loads((tmp_path / "tune.json").read_text())
-    assert result["gradient_steps"] == 2 * 2 * 2 * (50 + 64)
+    assert result["gradient_steps"] == 2 * 2 * 2 * (50 + 16)
     assert io.encode(tuned) == result["controller"]
     assert (tmp_path / "tune.png").read_bytes().startswith(b"\x89PNG")
 
@@ -57,6 +57,28 @@ def test_tune_asks_for_what_its_options_say_and_writes_what_it_gets(tmp_path, co
     assert isinstance(cpjax.load(tmp_path / "tuned.json").regulator.design, PoleFactors)
     assert json.loads((tmp_path / "tune.json").read_text())["gradient_steps"] == 8
     assert (tmp_path / "tune.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_tuning_that_settles_from_no_start_says_so_in_its_exit_code(tmp_path, command, monkeypatch):
+    def pretended(plant, free, plan, *, progress, checkpoint):
+        vector = np.asarray(free.start())
+        record = {"step": 0, "scores": [30.0], "success_rates": [0.0], "settling_times": [float("nan")], "loss": 1.0}
+        return Tuning(free.controller, vector, free.labels, vector, 30.0, 0.0, float("nan"), [record], 7, 8, 9.0)
+
+    monkeypatch.setattr(tuner, "tune", pretended)
+    done = command("tune", "--out", tmp_path)
+    assert done.code == 1, done.err
+    assert "0.00 %" in done.out
+    assert "nan" not in done.out
+    assert io.read_table(tmp_path / "tune.json")["success_rate"] == 0.0
+
+
+@pytest.mark.parametrize(("option", "value"), [("--design", "lqr"), ("--gate", "lyapunov")])
+def test_a_file_to_start_from_has_its_design_and_gate_already(option, value, tmp_path, command):
+    io.save(tmp_path / "law.json", preset("placement"))
+    done = command("tune", "--start-from", tmp_path / "law.json", option, value, "--out", tmp_path)
+    assert done.code == 2
+    assert option.removeprefix("--") in done.err
 
 
 @pytest.mark.parametrize(
@@ -120,5 +142,12 @@ def test_compare_writes_its_table_and_pictures(tmp_path, command):
 def test_compare_refuses_a_file_without_a_hybrid(tmp_path, command):
     cpjax.save(tmp_path / "plant.json", PLANT)
     done = command("compare", "--tuned-lqr", tmp_path / "plant.json", "--out", tmp_path)
+    assert done.code == 2
+    assert "tuned-lqr" in done.err
+
+
+def test_compare_refuses_a_controller_of_the_other_design(tmp_path, command):
+    io.save(tmp_path / "law.json", preset("placement"))
+    done = command("compare", "--tuned-lqr", tmp_path / "law.json", "--out", tmp_path)
     assert done.code == 2
     assert "tuned-lqr" in done.err

@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from cpjax import io, paper
+from cpjax import io
 from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, numbers_of, resolve
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
@@ -84,7 +84,7 @@ def run(given: argparse.Namespace) -> int:
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     setting = dict(sections["tune"])
-    chosen = {key: setting.pop(key) for key in ("design", "gate") if key in setting}
+    chosen: dict[str, Any] = {key: setting.pop(key) for key in ("design", "gate") if key in setting}
     controller = _begin(setting.pop("start_from", "bland"), plant, chosen)
     names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}
     free = free_parameters(controller, **names, full_q=setting.pop("full_q", "diagonal") == "full")
@@ -103,8 +103,8 @@ def run(given: argparse.Namespace) -> int:
     print_table("Parameters, SI units", ("parameter", "start", "tuned"), rows, text_columns=1)
     after = f", after {tuning.settling_time:.3f} s on average" if tuning.success_rate > 0.0 else ""
     print(
-        f"{100 * tuning.success_rate:.2f} % of {plan.final} starts settle{after}; {tuning.value_steps / 1e6:.1f} M steps of values, {tuning.gradient_steps / 1e6:.2f} M of gradients, "
-        f"{tuning.seconds:.0f} s"
+        f"{100 * tuning.success_rate:.2f} % of {plan.final} starts settle{after}; {tuning.value_steps / 1e6:.1f} M "
+        f"steps of values, {tuning.gradient_steps / 1e6:.2f} M of gradients, {tuning.seconds:.0f} s"
     )
     print(f"wrote {given.out / 'tuned.json'}, tune.json and tune.png")
     (given.out / "checkpoint.npz").unlink(missing_ok=True)

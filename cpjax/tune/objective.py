@@ -119,7 +119,7 @@ class TerminalCost:
 
 @pytree
 class Unfinished:
-    """The time that a stopped run left undone [s]: counted as badly spent, so that nothing is gained by being stopped."""
+    """The time that a stopped run left undone [s]: counted as badly spent, so that being stopped gains nothing."""
 
     duration: Scalar = number("s", "of the whole run", above=0.0)
 
@@ -130,7 +130,7 @@ class Unfinished:
         return memory + sample.elapsed
 
     def finish(self, memory: jax.Array, last: Sample) -> jax.Array:
-        return self.duration - memory
+        return jnp.asarray(self.duration, memory.dtype) - memory
 
 
 @pytree

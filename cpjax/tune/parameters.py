@@ -189,7 +189,7 @@ def free_parameters(
         raise InputError("full_q", full_q, "False: there is no Q among the free parameters")
     if "Q" in chosen and not full_q:
         Q = np.asarray(_weights(controller).Q)
-        if np.any(Q != np.diag(np.diagonal(Q))):
+        if np.count_nonzero(Q - np.diag(np.diagonal(Q))):
             raise InputError("full_q", full_q, "True: the controller's Q is not diagonal")
     sizes = {"Q": 10 if full_q else 4, "a": 2, "b": 2}
     slots, begin = [], 0

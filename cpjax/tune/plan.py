@@ -32,7 +32,7 @@ class Plan:
       learning_rate: Adam's, at first; it falls to a twentieth along a cosine.
       duration: of the tuning's rollouts [s].
       dt: their step [s].
-      spare_rate: steps beyond those, for crossings, in each second [1/s]; the rest of a run that needs more is lost time.
+      spare_rate: steps beyond those, for crossings, in each second [1/s]; what a run leaves undone is lost.
       first_width: the target's at first [rad and m].
       last_width: and after six tenths of the steps, reached geometrically.
       aggregate: what makes one number of a batch: the mean over a `tail`, a soft maximum or a success-weighted mean.

@@ -372,8 +372,8 @@ def _watched(count: int) -> int:
 def fastest_pole_bound(A: jax.Array) -> jax.Array:
     """A bound on the largest eigenvalue's magnitude of A (4, 4): |A^64|^(1/64) in the Frobenius norm (Gelfand, 1941).
 
-    Unlike the eigenvalues it has a derivative where some of them meet. It exceeds them by the 64th root of the condition
-    of A's eigenvectors, a tenth or so.
+    Unlike the eigenvalues it has a derivative where some of them meet. It exceeds them by the 64th root of the
+    condition of A's eigenvectors, a tenth or so.
     """
     tiny = float(np.finfo(A.dtype).tiny)
     logarithm = jnp.zeros((), A.dtype)

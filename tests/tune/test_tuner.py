@@ -77,13 +77,13 @@ def test_candidates_are_compared_on_more_and_more_starts_and_the_given_controlle
 def test_a_law_whose_crossings_cannot_be_located_scores_as_one_that_fails():
     free = free_parameters(beginning("bland", "placement", PLANT))
     scores = {}
-    for spare in (0, 64):
-        tuner = _Tuner(PLANT, free, dataclasses.replace(SMALL, spare_steps=spare, horizon=8.0))
+    for spare in (0.0, 32.0):
+        tuner = _Tuner(PLANT, free, dataclasses.replace(SMALL, spare_rate=spare, horizon=8.0))
         found, rates, _ = tuner._score(np.asarray(free.start())[None], 4, 1)
         assert rates[0] == 1.0
         scores[spare] = found[0]
-    assert scores[64] < 8.0
-    assert scores[0] == pytest.approx(scores[64] + 3.0 * 8.0)
+    assert scores[32.0] < 8.0
+    assert scores[0.0] == pytest.approx(scores[32.0] + 3.0 * 8.0)
 
 
 @pytest.mark.parametrize("aggregate", AGGREGATES)
@@ -120,12 +120,25 @@ def test_a_bad_plan_is_refused(field, value):
         Plan(**{field: value})
 
 
+@pytest.mark.parametrize(
+    ("step", "field"), [("horizon_dt", "horizon"), ("final_dt", "final_horizon"), ("dt", "duration")]
+)
+def test_a_length_that_is_no_whole_number_of_steps_has_its_own_name(step, field):
+    with pytest.raises(InputError) as caught:
+        Plan(**{step: 0.3})
+    assert caught.value.field == field
+
+
 def test_plants_are_drawn_within_their_spread():
     plants = sample_plants(PLANT, 200, spread=0.2, seed=1)
+    units = {"cart_friction": PLANT.motor.damping, "pivot_friction": 0.4 * math.sqrt(0.5 * 9.81 * 0.7 * 0.5 * 0.7**2)}
     for name in UNCERTAIN:
         part = PLANT.motor if hasattr(PLANT.motor, name) else PLANT
         drawn = getattr(plants.motor if part is PLANT.motor else plants, name)
         nominal = float(getattr(part, name))
+        if nominal == 0.0:  # the paper's plant has no friction: a share of nothing is nothing
+            assert 0.0 <= np.min(drawn) < np.max(drawn) <= 0.2 * units[name]
+            continue
         assert drawn.shape == (200,)
         assert np.all(np.abs(drawn - nominal) <= 0.2 * nominal + 1e-12)
     one = sample_plants(PLANT, 5, spread=0.2, seed=1, only="pole_mass")
