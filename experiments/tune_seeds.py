@@ -54,7 +54,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
         rows.append(row)
         if (name, begin) == CASES[0][:2] and float(made["score"]) < best.get(design, math.inf):
             best[design] = float(made["score"])
-            io.save(out / PRESETS[design], controller)
+            io.save(out / f"{PRESETS[design]}.json", controller)
         good = row["evaluation"]
         print(
             f"{case:29} score {float(row['score']):.3f}  {100 * good['success_rate']:7.3f} %  "
