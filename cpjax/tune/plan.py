@@ -23,7 +23,8 @@ class Plan:
       seed: of everything random. Starts of a tuning are never those that a seed names for `cpjax.sample_starts`.
       goal: the weights of the objective.
       candidates: random controllers beside the given one; 0 tunes the given one alone.
-      screening: starts by which candidates are compared, on values alone.
+      screening: starts by which candidates are compared at first, on values alone; the better quarter each time on four
+        times as many.
       restarts: how many of the best are tuned, the given one among them.
       batch: starts of each step, drawn anew.
       steps: of the optimiser.
@@ -43,8 +44,8 @@ class Plan:
       validate_every: steps between validations, each of which may be the last kept.
       validation: starts of a validation, the same ones each time.
       patience: validations without a better result after which a tuning ends; 0 for never.
-      finalists: restarts whose best is compared once more in the end.
-      final: starts of that comparison.
+      finalists: of the restarts' best, compared on `final` starts, so many are compared once more at the final step.
+      final: starts of either comparison.
       final_horizon: of its runs [s].
       final_dt: their step and control period [s].
       horizon: of screening and validation [s].
@@ -58,15 +59,15 @@ class Plan:
     seed: int = 1
     goal: Goal = dataclasses.field(default_factory=Goal)
     candidates: int = 4095
-    screening: int = 4
+    screening: int = 2
     restarts: int = 8
     batch: int = 16
-    steps: int = 80
+    steps: int = 66
     explore: float = 0.2
     learning_rate: float = 0.05
-    duration: float = 4.0
+    duration: float = 3.0
     dt: float = 0.02
-    spare_rate: float = 16.0
+    spare_rate: float = 20.0
     first_width: float = 0.2
     last_width: float = 0.03
     aggregate: str = "tail"
@@ -74,8 +75,8 @@ class Plan:
     temperature: float = 0.3
     threshold: float = 3.0
     clip: float = 2.0
-    validate_every: int = 5
-    validation: int = 128
+    validate_every: int = 6
+    validation: int = 256
     patience: int = 0
     finalists: int = 2
     final: int = 1024

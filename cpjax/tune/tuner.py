@@ -39,8 +39,8 @@ from cpjax.tune.plants import sample_plants
 Numbers = np.ndarray[Any, Any]
 Report = Callable[[int, int, str], None]
 
-_FAILURE = 3.0  # what a start that fails counts, in horizons
-_SCREEN, _STEP, _VALIDATE, _FINAL, _CANDIDATES, _NOISE = range(6)  # what random numbers are for
+_FAILURE = 30.0  # what a start that fails counts, in horizons: success first, then time
+_SCREEN, _STEP, _VALIDATE, _SEMIFINAL, _FINAL, _CANDIDATES, _NOISE = range(7)  # what random numbers are for
 _BLOCK, _CONTROLLERS = 512, 64  # lanes that are simulated, and controllers that are designed, at once
 
 
@@ -222,7 +222,8 @@ class _Tuner:
     def finish(self, memory: _Memory, began: float) -> Tuning:
         """Compares the best restarts on more starts and takes the best of them."""
         plan = self.plan
-        chosen = np.argsort(memory.scores, kind="stable")[: plan.finalists]
+        semifinal, _, _ = self._score(memory.best, plan.final, _SEMIFINAL)
+        chosen = np.argsort(semifinal, kind="stable")[: plan.finalists]
         scores, rates, times = self._score(memory.best[chosen], plan.final, _FINAL)
         best = int(np.argmin(scores))
         vector = memory.best[chosen[best]]
@@ -235,7 +236,9 @@ class _Tuner:
             success_rate=float(rates[best]),
             settling_time=float(times[best]),
             history=memory.history,
-            value_steps=memory.value_steps + len(chosen) * self._value_steps(plan.final, final=True),
+            value_steps=memory.value_steps
+            + len(semifinal) * self._value_steps(plan.final)
+            + len(chosen) * self._value_steps(plan.final, final=True),
             gradient_steps=memory.gradient_steps,
             seconds=time.perf_counter() - began,
         )
@@ -330,13 +333,15 @@ class _Tuner:
             return jax.tree.map(lambda column: column.reshape(len(vectors), starts_each), found)
 
         runs = over(self.evaluated if final else self.validated, count)
-        # What has more crossings than can be located slides along its gate's boundary, and chatters on a real rig.
-        sliding = (over(self.located_runs, _watched(count)).flag & Flag.OVERFLOW) != 0
         failure = _FAILURE * horizon * max(1.0, float(goal.time))
         cost = np.where(runs.success, goal.time * runs.settling_time, failure)
         cost = cost + goal.effort * runs.effort + goal.jerkiness * runs.voltage_variation
-        sliding = sliding & runs.success[:, : sliding.shape[1]]  # the others have failed already
-        score = np.mean(cost, axis=1) + failure * np.mean(sliding, axis=1)
+        score = np.mean(cost, axis=1)
+        if watched := _watched(count):
+            # What has more crossings than can be located slides along its gate's boundary, and chatters on a real rig.
+            sliding = (over(self.located_runs, watched).flag & Flag.OVERFLOW) != 0
+            sliding = sliding & runs.success[:, :watched]  # the others have failed already
+            score = score + failure * np.mean(sliding, axis=1)
         score = np.where(np.isnan(score) | ~(poles <= plan.pole_limit), np.inf, score)
         successes = np.sum(runs.success, axis=1)
         settled = np.sum(np.where(runs.success, runs.settling_time, 0.0), axis=1)
@@ -365,8 +370,8 @@ def _in_blocks(function: Any, block: int, *trees: Any) -> Any:
 
 
 def _watched(count: int) -> int:
-    """Of so many starts, how many are run with located switching too."""
-    return min(count, max(16, count // 8))
+    """Of so many starts, how many are run with located switching too: an eighth, as each costs far more."""
+    return count // 8
 
 
 def fastest_pole_bound(A: jax.Array) -> jax.Array:
