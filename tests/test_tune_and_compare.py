@@ -27,7 +27,7 @@ def test_tune_writes_a_controller_that_other_commands_take(tmp_path, command):
     tuned = cpjax.load(tmp_path / "tuned.json")
     assert isinstance(tuned.regulator.design, LqrWeights)
     result = json.loads((tmp_path / "tune.json").read_text())
-    assert result["gradient_steps"] == 2 * 2 * 2 * (50 + 16)
+    assert result["gradient_steps"] == 2 * 2 * 2 * (50 + 20)
     assert io.encode(tuned) == result["controller"]
     assert (tmp_path / "tune.png").read_bytes().startswith(b"\x89PNG")
 

@@ -69,7 +69,7 @@ def test_candidates_are_compared_on_more_and_more_starts_and_the_given_controlle
     assert asked == [(256, 1), (64, 4), (16, 16), (2, SMALL.validation)]
     np.testing.assert_array_equal(memory.vectors[0], np.asarray(free.start()))
     assert memory.vectors[1, 0] == np.min(seen[0][1:])
-    steps = sum(len_ * count * 375 + len_ * count * (100 + SMALL.spare_steps) for len_, count in asked)
+    steps = sum(n * (count * 375 + count // 8 * (100 + SMALL.spare_steps)) for n, count in asked)
     assert memory.value_steps == steps
 
 
@@ -79,11 +79,11 @@ def test_a_law_whose_crossings_cannot_be_located_scores_as_one_that_fails():
     scores = {}
     for spare in (0.0, 32.0):
         tuner = _Tuner(PLANT, free, dataclasses.replace(SMALL, spare_rate=spare, horizon=8.0))
-        found, rates, _ = tuner._score(np.asarray(free.start())[None], 4, 1)
+        found, rates, _ = tuner._score(np.asarray(free.start())[None], 16, 1)
         assert rates[0] == 1.0
         scores[spare] = found[0]
     assert scores[32.0] < 8.0
-    assert scores[0.0] == pytest.approx(scores[32.0] + 3.0 * 8.0)
+    assert scores[0.0] == pytest.approx(scores[32.0] + 30.0 * 8.0)
 
 
 @pytest.mark.parametrize("aggregate", AGGREGATES)
@@ -109,7 +109,7 @@ def test_a_start_that_cannot_be_simulated_does_no_harm(tuner):
         ("starts", "nowhere"),
         ("batch", 0),
         ("learning_rate", -1.0),
-        ("dt", 0.3),
+        ("dt", 0.7),
         ("plant_spread", 1.0),
         ("steps", 1.5),
         ("aggregate", "best"),
@@ -125,7 +125,7 @@ def test_a_bad_plan_is_refused(field, value):
 )
 def test_a_length_that_is_no_whole_number_of_steps_has_its_own_name(step, field):
     with pytest.raises(InputError) as caught:
-        Plan(**{step: 0.3})
+        Plan(**{step: 0.7})
     assert caught.value.field == field
 
 
