@@ -3,8 +3,8 @@
     python experiments/tuner_cost.py
 
 Values: the settling time of 192 starts, 5 s, a control held over 4 ms, as a search without gradients asks for them.
-With a gradient: a step of `cpjax tune`, 8 controllers and 16 starts each, 4 s at 20 ms, located switching, in the same
-nine parameters. Either runs with and without two options of XLA's CPU compiler, each combination in a process of its
+With a gradient: a step of `cpjax tune` as a `Plan` has it, 8 controllers and 16 starts each, 3 s at 20 ms, located
+switching, in the same nine parameters. Either runs with and without two options of XLA's CPU compiler, each combination in a process of its
 own, and all processes in turn; the best of each counts.
 """
 
@@ -78,7 +78,9 @@ def _in_a_process(design: str, work: str, options: str, quick: bool) -> float:
 def _measure(design: Any, work: str, quick: bool) -> float:
     plant = paper.appendix_plant()
     free = free_parameters(beginning("bland", design, plant))
-    restarts, count, duration, dt = (1, 192, 5.0, 0.004) if work == "values" else (8, 16, 4.0, 0.02)
+    plan = Plan()
+    with_gradient = (plan.restarts, plan.batch, plan.duration, plan.dt)
+    restarts, count, duration, dt = (1, 192, 5.0, 0.004) if work == "values" else with_gradient
     starts = jax.tree.map(jnp.asarray, sample_starts("hanging", 2 if quick else count, seed=1))
     duration = 10.0 * dt if quick else duration
 
@@ -88,7 +90,7 @@ def _measure(design: Any, work: str, quick: bool) -> float:
 
     def outside(vector: jax.Array, start: State) -> jax.Array:
         fold = TimeOutside(0.1, 0.1)
-        settings: dict[str, Any] = {"switching": "located", "spare_steps": Plan().spare_steps}
+        settings: dict[str, Any] = {"switching": "located", "spare_steps": plan.spare_steps}
         found: jax.Array = measure(plant, free.build(vector), start, duration=duration, dt=dt, metrics=fold, **settings)
         return found
 
@@ -101,7 +103,7 @@ def _measure(design: Any, work: str, quick: bool) -> float:
         began = time.perf_counter()
         jax.block_until_ready(of_all(vectors, starts))  # type: ignore[no-untyped-call]  # untyped in JAX
         times.append(time.perf_counter() - began)
-    steps = round(duration / dt) + (Plan().spare_steps if work == "gradients" else 0)
+    steps = round(duration / dt) + (plan.spare_steps if work == "gradients" else 0)
     return restarts * jnp.shape(starts.x)[0] * steps / min(times[1:])
 
 
