@@ -4,8 +4,8 @@
 
 Values: the settling time of 192 starts, 5 s, a control held over 4 ms, as a search without gradients asks for them.
 With a gradient: a step of `cpjax tune` as a `Plan` has it, 8 controllers and 16 starts each, 3 s at 20 ms, located
-switching, in the same nine parameters. Either runs with and without two options of XLA's CPU compiler, each combination in a process of its
-own, and all processes in turn; the best of each counts.
+switching, in the same nine parameters. Either runs with and without two options of XLA's CPU compiler, each
+combination in a process of its own, and all processes in turn; the best of each counts.
 """
 
 import itertools
