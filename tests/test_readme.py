@@ -29,6 +29,7 @@ def test_the_python_of_the_readme_runs(capsys):
     assert abs(float(third)) > 1e-6
 
 
+@pytest.mark.slow
 def test_the_python_of_the_design_page_runs():
     page = (ROOT / "docs" / "design.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
@@ -39,6 +40,7 @@ def test_the_python_of_the_design_page_runs():
     assert names["factors"].poles().shape == (4,)
 
 
+@pytest.mark.slow
 def test_the_python_of_the_page_on_gradients_runs(capsys):
     page = (ROOT / "docs" / "gradients.md").read_text()
     exec(compile("\n".join(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)), "gradients.md", "exec"), {})

@@ -114,6 +114,7 @@ def test_a_start_on_the_gate_and_one_inside_it_are_in_the_regulator():
         assert run.mode[0] == 1
 
 
+@pytest.mark.slow
 def test_in_a_sweep_each_start_crosses_at_its_own_time_as_if_alone():
     starts = cpjax.sample_starts("hanging", 6, seed=3)
     together = cpjax.sweep(PLANT, SOFT, starts, duration=4.0, dt=2e-3, switching="located", chunk=4)
@@ -142,6 +143,7 @@ def test_a_run_with_too_few_spare_steps_is_stopped_flagged_and_no_success():
     )
 
 
+@pytest.mark.slow
 def test_a_crossing_takes_as_many_spare_steps_as_it_says():
     inside = State(0.0, 0.0, 0.6, -3.0)  # into the gate, without the clip
     plant = replace(PLANT, motor=replace(PLANT.motor, voltage_limit=1e4))
@@ -335,6 +337,7 @@ def test_read_per_step_the_gate_has_no_derivative_and_the_others_are_off(derivat
     assert np.max(np.abs(plain / reverse[0] - 1.0)[[0, 1, 6, 7]]) > 1e-2
 
 
+@pytest.mark.slow
 def test_float32_gives_the_derivatives_to_three_digits(derivatives):
     x, reverse = derivatives
     narrow = jax.jit(jax.vmap(jax.grad(cost)))(x.astype(jnp.float32))

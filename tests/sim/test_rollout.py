@@ -133,6 +133,7 @@ def test_the_control_period_and_not_the_step_decides_what_the_plant_does():
     np.testing.assert_allclose(fine.state.theta[::8], coarse.state.theta, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_dense_sampled_clock_approaches_the_continuous_one():
     gentle = cpjax.EnergySwingUp(PLANT, energy_gain=0.5, kick=0.0)
     settings = {"duration": 1.0, "save_every": 1}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pytest
 
 import cpjax
 from cpjax import paper
@@ -24,6 +25,7 @@ def test_4096_starts_of_10_s_run_under_one_vmap_within_a_gibibyte(monkeypatch):
     assert figures["peak_MiB"] < 1024
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_the_chunk():
     starts = cpjax.sample_starts("anywhere", 7, seed=4)
     settings = {"duration": 1.0, "dt": 0.002, "clock": "continuous"}

@@ -310,6 +310,7 @@ def test_the_sensitivities_are_how_far_scipys_gains_move(plant, count):
     assert np.sum(sensitivities > 0.0) == count
 
 
+@pytest.mark.slow
 def test_the_plant_may_be_of_float32_arrays():
     audit = audit_gains(printed_in_the_paper(), cast(APPENDIX, jnp.float32), parameters=PAIR, **SMALL)
     assert audit.best(2).worst == pytest.approx(0.355, abs=0.002)
