@@ -24,6 +24,7 @@ _PLANNED = {
     "candidates": "random controllers to choose restarts from",
     "restarts": "controllers that are tuned side by side",
     "batch": "starts of a step",
+    "resample": "steps after which these are drawn anew; 0 to keep the first ones",
     "steps": "of the optimiser",
     "learning_rate": "Adam's, at first",
     "duration": "of the tuning's rollouts [s]",

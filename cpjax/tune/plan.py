@@ -26,7 +26,8 @@ class Plan:
       screening: starts by which candidates are compared at first, on values alone; the better quarter each time on four
         times as many.
       restarts: how many of the best are tuned, the given one among them.
-      batch: starts of each step, drawn anew.
+      batch: starts of each step.
+      resample: steps after which these are drawn anew; 0 to keep the first ones.
       steps: of the optimiser.
       explore: after each validation the worse half of the restarts goes on from the better half, with so much noise on
         the unconstrained parameters, less and less towards the end; 0 to let all of them be.
@@ -62,6 +63,7 @@ class Plan:
     screening: int = 2
     restarts: int = 8
     batch: int = 16
+    resample: int = 1
     steps: int = 66
     explore: float = 0.2
     learning_rate: float = 0.05
@@ -142,6 +144,7 @@ _COUNTS = {
     "screening": 1,
     "restarts": 1,
     "batch": 1,
+    "resample": 0,
     "steps": 0,
     "validate_every": 1,
     "validation": 1,

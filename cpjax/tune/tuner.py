@@ -184,7 +184,7 @@ class _Tuner:
         end = min(memory.step + plan.validate_every, plan.steps)
         loss = jnp.full(vectors.shape[0], jnp.nan)
         for step in range(memory.step, end):
-            starts, plants = self._draw(plan.batch, _STEP, step)
+            starts, plants = self._draw(plan.batch, _STEP, step // plan.resample if plan.resample else 0)
             loss, slope = self.gradient(vectors, starts, plants, jnp.asarray(plan.width(step), vectors.dtype))
             with jax.numpy_dtype_promotion("standard"):  # optax's own arithmetic mixes dtypes
                 change, state = self.optimiser.update(slope, state)

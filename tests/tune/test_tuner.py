@@ -86,6 +86,28 @@ def test_a_law_whose_crossings_cannot_be_located_scores_as_one_that_fails():
     assert scores[0.0] == pytest.approx(scores[32.0] + 30.0 * 8.0)
 
 
+@pytest.mark.parametrize(("resample", "batches"), [(1, [0, 1, 2, 3]), (2, [0, 0, 1, 1]), (0, [0, 0, 0, 0])])
+def test_starts_are_drawn_anew_as_often_as_the_plan_says(resample, batches, monkeypatch):
+    tuner = _Tuner(
+        PLANT,
+        free_parameters(beginning("bland", "placement", PLANT)),
+        dataclasses.replace(SMALL, resample=resample, validate_every=4, candidates=1, restarts=1),
+    )
+    seen = []
+
+    def scored(tuner, vectors, count, purpose):
+        return vectors[:, 0], np.ones(len(vectors)), np.ones(len(vectors))
+
+    def gradient(vectors, starts, plants, width):
+        seen.append(float(starts.theta[0]))
+        return jnp.zeros(vectors.shape[0]), jnp.zeros_like(vectors)
+
+    monkeypatch.setattr(_Tuner, "_score", scored)
+    monkeypatch.setattr(tuner, "gradient", gradient)
+    tuner.advance(tuner.begin())
+    assert [seen.index(one) for one in seen] == [batches.index(one) for one in batches]
+
+
 @pytest.mark.parametrize("aggregate", AGGREGATES)
 def test_a_batch_is_aggregated_as_the_plan_says(aggregate):
     values = jnp.asarray([1.0, 2.0, 6.0])
