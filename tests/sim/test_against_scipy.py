@@ -197,6 +197,7 @@ def located_errors_by_step(continuous):
     return steps, np.array(before), np.array(after)
 
 
+@pytest.mark.slow
 def test_located_switching_is_of_fourth_order_across_clip_and_switch(located_errors_by_step):
     steps, before, after = located_errors_by_step
     assert fitted_order(steps[:3], before.mean(axis=1)[:3]) >= 3.7

@@ -329,6 +329,7 @@ def test_forward_mode_and_segments_and_one_start_alone_give_the_same(derivatives
     np.testing.assert_allclose(segments, reverse[0], rtol=1e-10, atol=1e-10 * np.max(np.abs(reverse)))
 
 
+@pytest.mark.slow
 def test_read_per_step_the_gate_has_no_derivative_and_the_others_are_off(derivatives):
     x, reverse = derivatives
     plain = jax.jit(jax.grad(lambda x: cost(x, switching="per_step")))(x[0])
