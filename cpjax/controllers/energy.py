@@ -58,8 +58,9 @@ class EnergySwingUp:
     def _kick_weight(self, state: State) -> Scalar:
         _, cos = sin_cos(state.theta)
         weight = self.model.pole_mass * self.model.gravity * self.model.pole_length
-        above_rest = 0.5 * self.model.pivot_inertia * state.theta_dot * state.theta_dot / weight + (1.0 + cos)
+        kinetic = 0.5 * self.model.pivot_inertia * state.theta_dot * state.theta_dot
+        above_rest = kinetic * (1.0 / weight) + (1.0 + cos)
         half_edge, _ = sin_cos(0.5 * self.kick_radius)  # 1 - cos(edge) = 2 sin(edge / 2)^2, without cancellation
-        room = 1.0 - above_rest / (2.0 * half_edge * half_edge)
+        room = 1.0 - above_rest * (0.5 / (half_edge * half_edge))
         inside = jnp.maximum(room, 0.0)  # its kink vanishes in the cube
         return jnp.where(self.kick == 0.0, 0.0, inside * inside * inside)

@@ -41,8 +41,9 @@ class AngleGate:
     def margin(self, state: State, mode: jax.Array) -> Scalar:
         """Unit 1."""
         _, cos = sin_cos(state.theta)
-        _, edge = sin_cos(self.half_angle * _size(self.hysteresis, mode))
-        return cos - edge
+        # Both edges, then one of them: the edges do not depend on the state, so a batch computes them once.
+        (_, way_in), (_, way_out) = sin_cos(self.half_angle), sin_cos(self.half_angle * (1.0 + self.hysteresis))
+        return cos - jnp.where(mode == REGULATE, way_out, way_in)
 
 
 @pytree
@@ -61,11 +62,18 @@ class AngleRateGate:
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
         """Unit 1."""
-        size = _size(self.hysteresis, mode)
         _, cos = sin_cos(state.theta)
+        # Both regions, then one of them: they do not depend on the state, so a batch computes them once.
+        way_in, way_out = self._scales(0.0), self._scales(self.hysteresis)
+        per_drop, per_rate = (jnp.where(mode == REGULATE, b, a) for a, b in zip(way_in, way_out, strict=True))
+        relative_rate = state.theta_dot * per_rate
+        return 1.0 - (1.0 - cos) * per_drop - relative_rate * relative_rate
+
+    def _scales(self, widening: Scalar) -> tuple[Scalar, Scalar]:
+        """What 1 - cos(theta) and theta' are multiplied with, for a region (1 + widening) times as large."""
+        size = 1.0 + widening
         half_edge, _ = sin_cos(0.5 * self.half_angle * size)  # 1 - cos(edge) = 2 sin(edge / 2)^2, without cancellation
-        relative_rate = state.theta_dot / (self.rate * size)
-        return 1.0 - (1.0 - cos) / (2.0 * half_edge * half_edge) - relative_rate * relative_rate
+        return 0.5 / (half_edge * half_edge), 1.0 / (self.rate * size)
 
 
 @pytree
@@ -85,12 +93,7 @@ class LyapunovGate:
         s = deviation(state, self.reference)
         # Written out, not as a matrix product: under vmap each component stays an array of its own.
         form = sum(self.P[i, j] * s[i] * s[j] for i in range(4) for j in range(4))
-        return _size(self.hysteresis, mode) - form / self.level
-
-
-def _size(hysteresis: Scalar, mode: jax.Array) -> jax.Array:
-    """How large the boundary that applies in `mode` is, relative to the way in."""
-    return jnp.where(mode == REGULATE, 1.0 + hysteresis, 1.0)
+        return jnp.where(mode == REGULATE, 1.0 + self.hysteresis, 1.0) - form * (1.0 / self.level)
 
 
 def _check_widened_angle(gate: str, half_angle: Any, hysteresis: Any) -> None:

@@ -31,6 +31,9 @@ STOPPED = int(Flag.RUNAWAY | Flag.NON_FINITE | Flag.OVERFLOW)
 
 CHATTER_LENGTH = 8
 
+TURNED_FAR = 1 << 30
+"""Beside the flags, for `sweep` alone, which then computes the start again: see `Settings.turns`."""
+
 
 def describe(flag: int) -> str:
     """The flag in words, such as "runaway" or "clean"."""

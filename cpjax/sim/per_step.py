@@ -9,15 +9,24 @@ import jax
 import jax.numpy as jnp
 
 from cpjax.controllers.protocol import Controller
-from cpjax.numeric.trigonometry import sin_cos
+from cpjax.numeric.trigonometry import LARGEST_TURN, sin_cos
 from cpjax.plant import CartPole
-from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, Flag, unknown
+from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, TURNED_FAR, Flag, unknown
 from cpjax.sim.integrators import INTEGRATORS
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
-from cpjax.sim.stepper import Pair, applied_voltage, step_continuous, step_held
+from cpjax.sim.stepper import Pair, applied_voltage, step_continuous, step_held, step_held_by_turns
 from cpjax.state import ANGLE_LIMIT, RUNAWAY_LIMIT, State
+
+
+class _Instant(NamedTuple):
+    """What `_observe` computed and `_advance` needs again."""
+
+    rates: Pair
+    """(x'', theta'') [m/s^2, rad/s^2]."""
+    direction: Pair
+    """Sine and cosine of theta."""
 
 
 class _Loop(NamedTuple):
@@ -44,9 +53,9 @@ def simulate(
 
     def body(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], Sample | None]:
         loop, memory = carry
-        loop, sample, rates = _observe(plant, controller, loop, index, dt, settings)
+        loop, sample, instant = _observe(plant, controller, loop, index, dt, settings)
         memory = fold.update(memory, sample)
-        loop = _advance(plant, controller, loop, rates, dt, settings)
+        loop = _advance(plant, controller, loop, instant, dt, settings)
         return (loop, memory), (sample if every == 1 else None)
 
     def block(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], Sample]:
@@ -68,7 +77,7 @@ def simulate(
 
 def _observe(
     plant: CartPole, controller: Controller, loop: _Loop, index: jax.Array, dt: jax.Array, settings: Settings
-) -> tuple[_Loop, Sample, Pair]:
+) -> tuple[_Loop, Sample, _Instant]:
     """Reads the controller at step `index`, if that is a control instant, takes a sample, and hands the accelerations
     at this instant on to `_advance`, whose first stage they are."""
     state = loop.state
@@ -100,11 +109,11 @@ def _observe(
         crossing=jnp.zeros_like(mode),
         crossing_speed=jnp.zeros_like(voltage),
     )
-    return _Loop(state, mode, voltage, flag, changes), sample, rates
+    return _Loop(state, mode, voltage, flag, changes), sample, _Instant(rates, (sin, cos))
 
 
 def _advance(
-    plant: CartPole, controller: Controller, loop: _Loop, rates: Pair, dt: jax.Array, settings: Settings
+    plant: CartPole, controller: Controller, loop: _Loop, instant: _Instant, dt: jax.Array, settings: Settings
 ) -> _Loop:
     """Integrates one step. A run that would leave the bounds, or become non-finite, is held where it is and flagged.
 
@@ -113,12 +122,16 @@ def _advance(
     from upright rest, where all is finite, and dropped. (A law that is itself not finite at a state it is asked about
     still gives NaN derivatives; those of this library are finite.)
     """
-    state, method = loop.state, INTEGRATORS[settings.integrator]
+    state, method, far = loop.state, INTEGRATORS[settings.integrator], jnp.zeros_like(loop.flag)
+    rates, direction = instant
     stopped = (loop.flag & STOPPED) != 0
     ahead = jnp.maximum(jnp.abs(state.x_dot + dt * rates[0]), jnp.abs(state.theta_dot + dt * rates[1]))
     going = ~stopped & (ahead <= RUNAWAY_LIMIT)
     safe, safe_rates = jax.tree.map(lambda value: jnp.where(going, value, 0.0), (state, rates))
-    if settings.clock == "continuous":
+    if settings.turns:  # values only, so nothing has to be safe
+        after, turn = step_held_by_turns(plant, method, state, direction, loop.voltage, dt, rates)
+        far = jnp.where(going & (turn > LARGEST_TURN), TURNED_FAR, 0)
+    elif settings.clock == "continuous":
         after = step_continuous(plant, controller, method, safe, loop.mode, dt, safe_rates)
     else:
         after = step_held(plant, method, safe, jnp.where(going, loop.voltage, 0.0), dt, safe_rates)
@@ -128,4 +141,4 @@ def _advance(
     finite = jnp.isfinite(ahead + after.x + after.x_dot + after.theta + after.theta_dot)
     reason = jnp.where(finite, int(Flag.RUNAWAY), int(Flag.NON_FINITE))
     state = jax.tree.map(lambda old, new: jnp.where(good, new, old), state, after)
-    return loop._replace(state=state, flag=loop.flag | jnp.where(stopped | good, 0, reason))
+    return loop._replace(state=state, flag=loop.flag | jnp.where(stopped | good, 0, reason) | far)

@@ -25,6 +25,8 @@ class Settings(NamedTuple):
     """Beyond `steps`, for crossings; 0 where none are located."""
     integrator: str
     checkpoint: Checkpoint
+    turns: bool = False
+    """Held steps by `step_held_by_turns`; a start for which that was not accurate has the flag `TURNED_FAR`."""
 
 
 def check_settings(

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from cpjax.controllers.protocol import Controller, SmoothController
-from cpjax.numeric.trigonometry import sin_cos
+from cpjax.numeric.trigonometry import sin_cos, turned
 from cpjax.plant import CartPole
 from cpjax.pytree import Scalar
 from cpjax.sim.integrators import Acceleration, Integrator
@@ -36,6 +36,35 @@ def step_held(
         return plant.acceleration(sin, cos, v, plant.motor.force(voltage, v[0]))
 
     return _integrate(integrator, acceleration, state, dt, first)
+
+
+def step_held_by_turns(
+    plant: CartPole,
+    integrator: Integrator,
+    state: State,
+    direction: Pair,
+    voltage: Scalar,
+    dt: Scalar,
+    first: Pair | None = None,
+) -> tuple[State, jax.Array]:
+    """As `step_held`, and the largest turn away from `state` [rad] of the angles at which the plant was evaluated.
+
+    Their sines and cosines are those at `state`, turned. That is right to rounding if no turn was larger than
+    `cpjax.numeric.trigonometry.LARGEST_TURN`; the caller is to see to it.
+
+    Args:
+      direction: sine and cosine of the angle at `state`.
+    """
+    largest = jnp.zeros_like(state.theta)
+
+    def acceleration(q: Pair, v: Pair) -> Pair:
+        nonlocal largest
+        turn = jnp.asarray(q[1] - state.theta)
+        largest = jnp.maximum(largest, jnp.abs(turn))
+        sin, cos = turned(jnp.asarray(direction[0]), jnp.asarray(direction[1]), turn)
+        return plant.acceleration(sin, cos, v, plant.motor.force(voltage, v[0]))
+
+    return _integrate(integrator, acceleration, state, dt, first), largest
 
 
 def step_continuous(
