@@ -29,6 +29,7 @@ from cpjax.errors import InputError
 from cpjax.io import load, save
 from cpjax.plant import CartPole, LinearModel, Motor, linearize
 from cpjax.presets import preset
+from cpjax.runtime import configure_cpu
 from cpjax.sim.flags import Flag
 from cpjax.sim.gradients import Gradients, gradients
 from cpjax.sim.metrics import Metrics, ProtocolMetrics, TimeOutside
@@ -71,6 +72,7 @@ __all__ = [
     "Trajectory",
     "__version__",
     "care",
+    "configure_cpu",
     "dare",
     "discretize",
     "discretize_cost",

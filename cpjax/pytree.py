@@ -185,37 +185,51 @@ def is_traced(value: Any) -> bool:
     return isinstance(value, jax.core.Tracer)
 
 
-def check(name: str, tree: Any) -> None:
+def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
     """Refuses a component that no rollout can run: JAX may have rebuilt it with anything.
 
+    Args:
+      batch: how many components the tree may hold: each of its leaves may have a leading axis of this length.
+
+    Returns:
+      For each leaf whether it has that axis.
+
     Raises:
-      InputError: a leaf that is no number, a number or matrix with a batch axis (which only `vmap` may take away), or a
-        concrete one outside its declared range.
+      InputError: a leaf that is no number, a number or matrix with another axis in front (which only `vmap` may take
+        away), or a concrete one outside its declared range.
     """
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    for path, leaf in leaves:
         if not (isinstance(leaf, (int, float)) or hasattr(leaf, "dtype")):
             allowed = "a number; a class of your own is made a component by the decorator cpjax.pytree.pytree"
             raise InputError(f"{name}{jax.tree_util.keystr(path)}", leaf, allowed)
-    if dataclasses.is_dataclass(tree):
-        _check_fields(name, tree)
+    batched = _check_fields(name, tree, batch) if dataclasses.is_dataclass(tree) else []
+    # A class that is a pytree in a way of its own has other leaves than fields; it is not looked into.
+    return batched if len(batched) == len(leaves) else [False] * len(leaves)
 
 
-def _check_fields(name: str, tree: Any) -> None:
-    declared = rules(type(tree))
+def _check_fields(name: str, tree: Any, batch: int | None) -> list[bool]:
+    declared, batched = rules(type(tree)), []
     for field in dataclasses.fields(tree):
         path, value, rule = f"{name}.{field.name}", getattr(tree, field.name), declared.get(field.name)
         if dataclasses.is_dataclass(value):
-            _check_fields(path, value)
+            batched += _check_fields(path, value, batch)
         elif isinstance(value, tuple):  # of components
             for i, one in enumerate(value):
-                check(f"{path}[{i}]", one)
+                batched += check(f"{path}[{i}]", one, batch)
         elif rule is not None or not declared:  # a State declares nothing and holds scalars
             expected = rule.shape if isinstance(rule, Matrix) else ()
-            if np.shape(value) != expected:
-                allowed = f"of shape {expected}; batches go through jax.vmap"
-                raise InputError(path, f"array of shape {np.shape(value)}", allowed)
+            batched.append(np.shape(value) != expected)
+            if batched[-1] and (batch is None or np.shape(value) != (batch, *expected)):
+                more = (
+                    "batches go through jax.vmap" if batch is None else f"or {(batch, *expected)}, one for each start"
+                )
+                raise InputError(path, f"array of shape {np.shape(value)}", f"of shape {expected}; {more}")
             if rule is not None:
                 rule.normalise(path, value)
+        else:
+            batched += [False] * len(jax.tree.leaves(value))
+    return batched
 
 
 def cast(tree: T, dtype: Any) -> T:

@@ -479,8 +479,9 @@ def test_a_batched_component_without_vmap_is_refused(arguments):
         (State(np.arange(2), 0.0, 0.0, 0.0), {}, "starts.x", "'array of dtype int64'", "of dtype float32 or float64"),
         (np.ones((2, 4)), {}, "starts", "array(", "a cpjax.State"),
         *(
-            (State(np.ones(2), 0.0, 0.0, 0.0), {"chunk": v}, "chunk", repr(v), "a whole number of starts, at least 1")
-            for v in (0, -1, 1.0, True, None, "1")
+            (State(np.ones(2), 0.0, 0.0, 0.0), {name: v}, name, repr(v), "a whole number of starts, at least 1")
+            for v in (0, -1, 1.0, True, "1")
+            for name in ("chunk", "block")
         ),
         (State(np.ones(2), 0.0, 0.0, 0.0), {"dt": 0.03}, "duration", "0.1", "a whole multiple of dt"),
         (State(np.ones(2), 0.0, 0.0, 0.0), {"clock": "x"}, "clock", "'x'", "continuous or sampled"),

@@ -72,7 +72,8 @@ def simulate(
     _, last, _ = _observe(plant, controller, loop, jnp.asarray(steps), dt, settings)
     if samples is not None:
         samples = jax.tree.map(lambda many, one: jnp.concatenate([many, one[None]]), samples, last)
-    return samples, last, fold.finish(fold.update(memory, last), last)
+    clean = last._replace(flag=last.flag & ~TURNED_FAR)
+    return samples, last, fold.finish(fold.update(memory, clean), clean)
 
 
 def _observe(

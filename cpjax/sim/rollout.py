@@ -17,6 +17,7 @@ from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.pytree import cast, check, pytree
 from cpjax.sim import located, per_step
+from cpjax.sim.flags import TURNED_FAR
 from cpjax.sim.metrics import Fold, ProtocolMetrics
 from cpjax.sim.settings import Checkpoint, Clock, Settings, Switching, check_settings
 from cpjax.state import State, checked_start
@@ -95,7 +96,7 @@ def rollout(
         duration, dt, clock, control_period, switching, integrator, save_every, spare_steps, checkpoint
     )
     start, dtype = checked_start(start, "start", batched=False)
-    arguments = _cast_arguments(plant, controller, metrics, dt, dtype, settings)
+    arguments, _ = cast_arguments(plant, controller, metrics, dt, dtype, settings)
     trajectory: Trajectory = _simulate(start, *arguments, settings=settings)
     return trajectory
 
@@ -118,24 +119,33 @@ def measure(
     """What `rollout(...).metrics` would be, without storing a trajectory. Arguments and errors as for `rollout`."""
     settings = check_settings(duration, dt, clock, control_period, switching, integrator, None, spare_steps, checkpoint)
     start, dtype = checked_start(start, "start", batched=False)
-    return _simulate(start, *_cast_arguments(plant, controller, metrics, dt, dtype, settings), settings=settings)
+    arguments, _ = cast_arguments(plant, controller, metrics, dt, dtype, settings)
+    return _simulate(start, *arguments, settings=settings)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _simulate(start: State, plant: CartPole, controller: Any, fold: Fold, dt: jax.Array, *, settings: Settings) -> Any:
-    simulate = located.simulate if settings.switching == "located" else per_step.simulate
-    samples, last, result = simulate(start, plant, controller, fold, dt, settings)
+    return simulate(start, plant, controller, fold, dt, settings)[0]
+
+
+def simulate(
+    start: State, plant: CartPole, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
+) -> tuple[Any, jax.Array]:
+    """Trajectory, or only what the fold made of it, and the last flag; of arguments that have been checked and cast."""
+    one = located.simulate if settings.switching == "located" else per_step.simulate
+    samples, last, result = one(start, plant, controller, fold, dt, settings)
     if samples is None:
-        return result
-    return Trajectory(
+        return result, last.flag
+    trajectory = Trajectory(
         time=samples.time,
         state=samples.state,
         voltage=samples.voltage,
         mode=samples.mode,
         cart_acceleration=samples.cart_acceleration,
-        flag=last.flag,
+        flag=last.flag & ~TURNED_FAR,
         metrics=result,
     )
+    return trajectory, last.flag
 
 
 def _without_designs(controller: Any) -> Any:
@@ -148,9 +158,14 @@ def _without_designs(controller: Any) -> Any:
     return jax.tree.map(bare, controller, is_leaf=lambda part: isinstance(part, StateFeedback))
 
 
-def _cast_arguments(
-    plant: Any, controller: Any, fold: Fold | None, dt: float, dtype: Any, settings: Settings
-) -> tuple[CartPole, Controller, Fold, jax.Array]:
+def cast_arguments(
+    plant: Any, controller: Any, fold: Fold | None, dt: float, dtype: Any, settings: Settings, batch: int | None = None
+) -> tuple[tuple[CartPole, Controller, Fold, jax.Array], list[bool]]:
+    """What `simulate` takes after the start, and for each of its leaves whether it has an axis of length `batch`.
+
+    Raises:
+      InputError: as `rollout` does.
+    """
     if not isinstance(plant, CartPole):
         raise InputError("plant", plant, "a cpjax.CartPole")
     fold = ProtocolMetrics() if fold is None else fold
@@ -159,11 +174,7 @@ def _cast_arguments(
     controller = _without_designs(as_controller(controller))
     if settings.switching == "located" and not isinstance(controller, SmoothController):
         raise InputError("controller", controller, "one with margin and successor, for located switching")
-    for name, part in (("plant", plant), ("controller", controller), ("metrics", fold)):
-        check(name, part)
-    return (
-        cast(plant, dtype),
-        cast(controller, dtype),
-        cast(fold, dtype),
-        jnp.asarray(dt, dtype=dtype),
-    )
+    parts = (("plant", plant), ("controller", controller), ("metrics", fold))
+    batched = [leaf for name, part in parts for leaf in check(name, part, batch)]
+    arguments = cast(plant, dtype), cast(controller, dtype), cast(fold, dtype), jnp.asarray(dt, dtype=dtype)
+    return arguments, [*batched, False]

@@ -1,22 +1,54 @@
-"""Many starts at once."""
+"""Many starts at once, on every core or every accelerator.
 
+Starts are simulated in blocks, which bound the memory and let progress be seen. A block is shared out to the devices
+(`jax.sharding`: the cores of a CPU that `cpjax.configure_cpu` made into devices, the GPUs of a machine, those of
+several hosts), and each works through its share in chunks: on a CPU so small that a chunk stays in the first cache.
+What is computed for a start does not depend on any of this.
+"""
+
+import functools
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from cpjax import runtime
 from cpjax.controllers.protocol import Controller, Law
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
+from cpjax.pytree import is_traced
+from cpjax.sim.flags import TURNED_FAR
 from cpjax.sim.metrics import Fold
-from cpjax.sim.rollout import measure
-from cpjax.sim.settings import Checkpoint, Clock, Switching
+from cpjax.sim.rollout import cast_arguments, simulate
+from cpjax.sim.settings import Checkpoint, Clock, Settings, Switching, check_settings
 from cpjax.state import State, checked_start
 
 Progress = Callable[[int, int], None]
 """Called with the number of starts done and their total."""
+
+_CHUNK = 128
+"""Starts at a time on a CPU where a loop is one compiled function: their state stays in the first cache."""
+
+_CHUNK_OF_SLOW_LOOPS = 4096
+"""On a CPU where each part of a step is a function: enough to make up for the calls."""
+
+_VECTOR = 16
+"""Numbers of float32 in the longest vectors of a CPU."""
+
+_STEPS_PER_BLOCK = 1 << 28
+"""About a second's work of a CPU."""
+
+_LARGEST_BLOCK = 1 << 30
+"""Bytes of results."""
+
+_AXIS = "starts"
+_SHARED_OUT: Any = PartitionSpec(_AXIS)  # type: ignore[no-untyped-call]  # untyped in JAX
+_EVERYWHERE: Any = PartitionSpec()  # type: ignore[no-untyped-call]
 
 
 def sweep(
@@ -30,54 +62,201 @@ def sweep(
     control_period: float | None = None,
     switching: Switching = "per_step",
     integrator: str = "rk4",
+    save_every: int | None = None,
     spare_steps: int | None = None,
     checkpoint: Checkpoint = "every_step",
     metrics: Fold | None = None,
-    chunk: int = 4096,
+    chunk: int | None = None,
+    block: int | None = None,
     progress: Progress | None = None,
 ) -> Any:
-    """The metrics of every start; nothing of the trajectories is stored.
+    """The metrics of every start, or their trajectories; see `rollout` for the arguments that are not described here.
+
+    Results are those of `rollout` to rounding. With several processes (`jax.distributed`), each calls this with the
+    same arguments and gets the whole result.
 
     Args:
+      plant: one for all starts, or one for each: any of its numbers may be an array of shape (n,).
+      controller: likewise; a gain may have shape (n, 1, 4). So may `metrics`.
       starts: a State of arrays of shape (n,), any n.
-      chunk: starts simulated together, at most. All chunks have one size (the last is filled up with copies), so that
-        one compilation serves all of them.
-      progress: called after each chunk.
+      save_every: None stores nothing of the trajectories; k keeps every k-th step, for all n starts, in memory
+        (`cpjax.record_sweep` writes them to disk as they come).
+      chunk: starts that one device simulates together, at most; None for what suits the machine.
+      block: starts computed between two calls of `progress`, at most; None for about a second's work of a CPU.
+      progress: called after each block of starts.
 
     Returns:
-      What `metrics` returns for one start, with a leading axis n; `Metrics` by default.
+      What `metrics` returns for one start, with a leading axis n; `Metrics` by default. With `save_every`, a
+      `Trajectory` of such arrays. Under `jit` or differentiation, by plain `vmap`.
 
     Raises:
-      InputError: as for `rollout`, and for `chunk` below 1.
+      InputError: as for `rollout`, and for `chunk` or `block` below 1.
     """
-    if isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1:
-        raise InputError("chunk", chunk, "a whole number of starts, at least 1")
-    starts, _ = checked_start(starts, "starts", batched=True)
-    total = jnp.shape(starts.x)[0]
-    chunk = math.ceil(total / math.ceil(total / chunk))  # as even as can be, so that little is simulated twice
-
-    def run(start: State) -> Any:
-        return measure(
-            plant,
-            controller,
-            start,
-            duration=duration,
-            dt=dt,
-            clock=clock,
-            control_period=control_period,
-            switching=switching,
-            integrator=integrator,
-            spare_steps=spare_steps,
-            checkpoint=checkpoint,
-            metrics=metrics,
-        )
-
-    results = []
-    for begin in range(0, total, chunk):
-        members = jnp.minimum(jnp.arange(begin, begin + chunk), total - 1)
-        part = jax.vmap(run)(jax.tree.map(lambda column, members=members: column[members], starts))
+    work = prepare(
+        plant,
+        controller,
+        starts,
+        duration=duration,
+        dt=dt,
+        clock=clock,
+        control_period=control_period,
+        switching=switching,
+        integrator=integrator,
+        save_every=save_every,
+        spare_steps=spare_steps,
+        checkpoint=checkpoint,
+        metrics=metrics,
+        chunk=chunk,
+        block=block,
+    )
+    if any(is_traced(leaf) for leaf in work.leaves):
+        columns, shared = _split(work.leaves, work.kind.batched)
+        return jax.vmap(lambda column: _one(column, shared, work.kind)[0])(columns)
+    parts = []
+    for begin in work.begins():
+        parts.append(work.block(begin))
         if progress is not None:
-            jax.block_until_ready(part)  # type: ignore[no-untyped-call]  # untyped in JAX
-            progress(min(begin + chunk, total), total)
-        results.append(part)
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:total], *results)
+            progress(min(begin + work.size, work.total), work.total)
+    return jax.tree.map(lambda *blocks: jnp.asarray(np.concatenate(blocks)), *parts)
+
+
+class _Kind(NamedTuple):
+    """What a compilation depends on, beside shapes and dtypes."""
+
+    structure: Any
+    """Of (start, (plant, controller, fold, dt))."""
+    batched: tuple[bool, ...]
+    """Which of its leaves have one entry for each start."""
+    settings: Settings
+    chunk: int
+    mesh: Mesh
+
+
+class Work(NamedTuple):
+    """A sweep, ready to be done a block at a time."""
+
+    kind: _Kind
+    leaves: list[Any]
+    total: int
+    size: int
+    """Starts of a block; the last one is filled up with copies of the last start."""
+
+    def begins(self) -> Iterator[int]:
+        """Where the blocks begin."""
+        return iter(range(0, self.total, self.size))
+
+    def block(self, begin: int) -> Any:
+        """The results of up to `size` starts from `begin` on, as NumPy arrays."""
+        result, flag = self._compute(begin, self.kind)
+        far = (flag & TURNED_FAR) != 0
+        if np.any(far):
+            settings = self.kind.settings._replace(turns=False)
+            in_full, _ = self._compute(begin, self.kind._replace(settings=settings))
+            result = jax.tree.map(lambda a, b: np.where(far.reshape(-1, *[1] * (a.ndim - 1)), b, a), result, in_full)
+        return jax.tree.map(lambda array: array[: self.total - begin], result)
+
+    def _compute(self, begin: int, kind: _Kind) -> tuple[Any, np.ndarray]:
+        members = np.minimum(np.arange(begin, begin + self.size), self.total - 1)
+        columns, shared = _split(self.leaves, kind.batched)
+        placed = [_place(np.asarray(column)[members], NamedSharding(kind.mesh, _SHARED_OUT)) for column in columns]
+        replicated = [_place(np.asarray(leaf), NamedSharding(kind.mesh, _EVERYWHERE)) for leaf in shared]
+        results = _compiled(kind.mesh.devices.flat[0].platform)(placed, replicated, kind)
+        gathered: tuple[Any, np.ndarray] = jax.tree.map(_gather, results)
+        return gathered
+
+
+def prepare(
+    plant: CartPole,
+    controller: Controller | Law,
+    starts: State,
+    *,
+    metrics: Fold | None,
+    chunk: int | None,
+    block: int | None,
+    duration: float,
+    dt: float,
+    clock: Clock = "continuous",
+    control_period: float | None = None,
+    switching: Switching = "per_step",
+    integrator: str = "rk4",
+    save_every: int | None = None,
+    spare_steps: int | None = None,
+    checkpoint: Checkpoint = "every_step",
+) -> Work:
+    """Checks a sweep's arguments and divides its starts into blocks; arguments and errors of `sweep`."""
+    for name, value in (("chunk", chunk), ("block", block)):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+            raise InputError(name, value, "a whole number of starts, at least 1")
+    settings = check_settings(
+        duration, dt, clock, control_period, switching, integrator, save_every, spare_steps, checkpoint
+    )
+    settings = settings._replace(turns=clock == "sampled")
+    starts, dtype = checked_start(starts, "starts", batched=True)
+    total = int(jnp.shape(starts.x)[0])
+    arguments, batched = cast_arguments(plant, controller, metrics, dt, dtype, settings, batch=total)
+    leaves, structure = jax.tree.flatten((starts, arguments))
+    devices = jax.devices()
+    lanes, size = _sizes(total, devices, settings, np.dtype(dtype).itemsize, chunk, block)
+    mesh = Mesh(np.array(devices), (_AXIS,))
+    kind = _Kind(structure, (True,) * 4 + tuple(batched), settings, lanes, mesh)
+    return Work(kind, leaves, total, size)
+
+
+def _sizes(
+    total: int, devices: list[Any], settings: Settings, itemsize: int, chunk: int | None, block: int | None
+) -> tuple[int, int]:
+    """Starts of a chunk, and of a block: as many chunks for each device."""
+    on_cpu = devices[0].platform == "cpu"
+    saved = 0 if settings.save_every is None else settings.steps // settings.save_every + 1
+    most = _LARGEST_BLOCK // (itemsize * 8 * (saved + 2))
+    if on_cpu:
+        most = min(most, _STEPS_PER_BLOCK // (settings.steps + settings.spare_steps))
+    most = max(1, (most if block is None else block) // len(devices))
+    share = math.ceil(total / len(devices))
+    if chunk is None:
+        best = (_CHUNK if runtime.fast_loops() else _CHUNK_OF_SLOW_LOOPS) if on_cpu else most
+        chunk = min(best, _VECTOR * math.ceil(share / _VECTOR))  # whole vectors, and a few starts make no whole chunk
+    chunk = min(chunk, most)
+    chunks = math.ceil(share / chunk)
+    blocks = math.ceil(chunks / (most // chunk))
+    return chunk, math.ceil(chunks / blocks) * chunk * len(devices)
+
+
+def _split(leaves: list[Any], batched: tuple[bool, ...]) -> tuple[list[Any], list[Any]]:
+    columns = [leaf for leaf, many in zip(leaves, batched, strict=True) if many]
+    return columns, [leaf for leaf, many in zip(leaves, batched, strict=True) if not many]
+
+
+def _one(column: list[Any], shared: list[Any], kind: _Kind) -> tuple[Any, jax.Array]:
+    """The result of one start, and its flag."""
+    columns, others = iter(column), iter(shared)
+    leaves = [next(columns) if many else next(others) for many in kind.batched]
+    start, (plant, controller, fold, dt) = jax.tree.unflatten(kind.structure, leaves)
+    return simulate(start, plant, controller, fold, dt, kind.settings)
+
+
+def _block(columns: list[jax.Array], shared: list[jax.Array], kind: _Kind) -> Any:
+    def share(columns: list[jax.Array], shared: list[jax.Array]) -> Any:
+        def chunk(column: list[jax.Array]) -> Any:
+            return jax.vmap(lambda lane: _one(lane, shared, kind))(column)
+
+        chunks = [column.reshape(-1, kind.chunk, *column.shape[1:]) for column in columns]
+        results = jax.lax.map(chunk, chunks)
+        return jax.tree.map(lambda result: result.reshape(-1, *result.shape[2:]), results)
+
+    specs = {"in_specs": (_SHARED_OUT, _EVERYWHERE), "out_specs": _SHARED_OUT}
+    return jax.shard_map(share, mesh=kind.mesh, check_vma=False, **specs)(columns, shared)
+
+
+@functools.cache
+def _compiled(platform: str) -> Any:
+    return jax.jit(_block, static_argnames="kind", compiler_options=runtime.compiler_options(platform))
+
+
+def _place(array: np.ndarray, sharding: NamedSharding) -> jax.Array:
+    return jax.make_array_from_callback(array.shape, sharding, lambda index: array[index])
+
+
+def _gather(array: jax.Array) -> np.ndarray:
+    whole = array if array.is_fully_addressable else multihost_utils.process_allgather(array, tiled=True)
+    return np.asarray(whole)

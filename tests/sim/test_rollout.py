@@ -165,10 +165,10 @@ def test_a_batch_is_the_same_as_one_start_at_a_time():
             np.testing.assert_allclose(a[i], b, rtol=1e-7)
 
 
-def test_sweep_reports_progress_chunk_by_chunk():
+def test_sweep_reports_progress_block_by_block():
     seen = []
     starts = cpjax.sample_starts("hanging", 5, seed=11)
-    settings = {"duration": 0.1, "dt": 0.002, "chunk": 2}
+    settings = {"duration": 0.1, "dt": 0.002, "block": 2}
     cpjax.sweep(PLANT, CENTRED, starts, progress=lambda done, total: seen.append((done, total)), **settings)
     assert seen == [(2, 5), (4, 5), (5, 5)]
 

@@ -1,0 +1,82 @@
+"""How JAX is to use a CPU: its cores as devices, and two options of XLA's compiler.
+
+By default XLA's CPU compiler makes several functions of one step of a simulation, computes what they share in each, and
+calls them one after the other: most of the time goes there. Two of its options end that:
+
+    xla_cpu_use_multi_output_fusion          what several results need is computed once
+    xla_cpu_small_while_loop_byte_threshold  a whole loop becomes one function
+
+They are not documented by XLA and have to be set before JAX starts, so a library cannot set them behind a user's back:
+`configure_cpu` does on request, and the command line does so for itself. They change speed, and results in the last
+bits. With a jaxlib that they were not tested with they are left out, and everything works without them.
+"""
+
+import functools
+import os
+from importlib.metadata import version
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.errors import InputError
+
+TESTED = ("0.10.2",)
+"""The versions of jaxlib with which the options were tested."""
+
+_OPTIONS = "xla_cpu_use_multi_output_fusion=true,xla_cpu_small_while_loop_byte_threshold=16777216"
+_FLAG = "--xla_backend_extra_options"
+
+
+def configure_cpu(devices: int | None = None) -> bool:
+    """Makes simulations on a CPU fast. Call it before JAX computes anything, once.
+
+    Args:
+      devices: as how many devices the CPU is to appear, which `sweep` shares its starts out to; by default as many as
+        there are cores that this process may use.
+
+    Returns:
+      Whether the compiler's options were set: not with another jaxlib than the tested ones, nor where XLA_FLAGS has
+      options of this kind already.
+
+    Raises:
+      InputError: `devices` below 1.
+      RuntimeError: JAX has started already, so that nothing can be set any more.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    devices = cores if devices is None else devices
+    if isinstance(devices, bool) or not isinstance(devices, int) or devices < 1:
+        raise InputError("devices", devices, "a whole number of devices, at least 1")
+    flags = os.environ.get("XLA_FLAGS", "")
+    try:
+        if "xla_force_host_platform_device_count" not in flags:
+            jax.config.update("jax_num_cpu_devices", devices)  # type: ignore[no-untyped-call]  # untyped in JAX
+        else:  # which of the two holds is then XLA_FLAGS; this only asks whether JAX has started
+            jax.config.update("jax_num_cpu_devices", jax.config.jax_num_cpu_devices)  # type: ignore
+    except RuntimeError as problem:
+        message = "configure_cpu is too late: JAX has started. Call it before anything is computed with JAX"
+        raise RuntimeError(message) from problem
+    if version("jaxlib") not in TESTED or _FLAG in flags:
+        return False
+    os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}={_OPTIONS}".strip()
+    return True
+
+
+@functools.cache
+def fast_loops() -> bool:
+    """Whether the compiler makes one function of a small loop; starts JAX. It is asked by compiling one."""
+    if jax.default_backend() != "cpu":
+        return False
+
+    def loop(x: jax.Array) -> jax.Array:
+        return jax.lax.fori_loop(0, 8, lambda _, y: jnp.sin(y) + y, x)
+
+    # 64 KiB: by default only loops over less than 1 KiB are made one function.
+    text = jax.jit(loop).lower(jnp.zeros((1 << 14,), jnp.float32)).compile().as_text() or ""
+    return "xla_cpu_small_call" in text
+
+
+def compiler_options(platform: str) -> dict[str, Any]:
+    """Options for `jax.jit` of a function that simulates a batch."""
+    # The widest vectors that the CPU has; by default LLVM keeps to half of AVX-512's.
+    return {"xla_cpu_prefer_vector_width": 512} if platform == "cpu" else {}
