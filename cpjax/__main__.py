@@ -2,7 +2,7 @@
 
 import sys
 
-from cpjax.cli import main
+from cpjax.cli import command
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(command())

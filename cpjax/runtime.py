@@ -12,8 +12,11 @@ bits. With a jaxlib that they were not tested with they are left out, and everyt
 """
 
 import functools
+import hashlib
 import os
+import platform
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -60,6 +63,44 @@ def configure_cpu(devices: int | None = None) -> bool:
         return False
     os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}={_OPTIONS}".strip()
     return True
+
+
+def keep_compilations() -> Path | None:
+    """Has JAX keep on disk what it compiles, so that the next process need not; returns where, or None if it cannot.
+
+    In the user's cache folder ($XDG_CACHE_HOME or ~/.cache), unless JAX's own settings name another or forbid it.
+    """
+    folder = jax.config.jax_compilation_cache_dir
+    if not jax.config.jax_enable_compilation_cache:
+        return None
+    if folder is None:
+        # Compiled code is for one kind of CPU; a home may be seen by several.
+        kind = hashlib.sha256(_cpu().encode()).hexdigest()[:12]
+        cache = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+        folder = os.path.join(cache, "cpjax", kind)
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError:
+        return None
+    if not os.access(folder, os.W_OK):
+        return None
+    for name, value in (
+        ("jax_compilation_cache_dir", folder),
+        ("jax_persistent_cache_min_compile_time_secs", 0.1),
+        ("jax_persistent_cache_min_entry_size_bytes", 0),
+    ):
+        jax.config.update(name, value)  # type: ignore[no-untyped-call]  # untyped in JAX
+    return Path(folder)
+
+
+def _cpu() -> str:
+    """What tells this CPU's instructions from another's."""
+    try:
+        with open("/proc/cpuinfo") as lines:
+            flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    except OSError:
+        flags = platform.processor()
+    return f"{platform.machine()} {flags}"
 
 
 @functools.cache

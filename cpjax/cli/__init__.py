@@ -47,8 +47,18 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command and returns its exit code; see `EXIT_CODES`."""
+def command() -> int:
+    """What the shell calls: `main`, in a process of its own, whose JAX may be set up for the command."""
+    return main(set_up=True)
+
+
+def main(arguments: Sequence[str] | None = None, *, set_up: bool = False) -> int:
+    """Runs one command and returns its exit code; see `EXIT_CODES`.
+
+    Args:
+      set_up: keep what is compiled for the next process, and set the compiler's options where the command simulates
+        many starts. Only before JAX has started.
+    """
     parser = make_parser()
     try:
         options = parser.parse_args(arguments)
@@ -57,6 +67,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     import jax
 
+    if set_up:
+        from cpjax import runtime
+
+        runtime.keep_compilations()
+        if getattr(options, "many_starts", False):
+            runtime.configure_cpu()
     # The protocol's figures are float64. Set here, in the application: the library never touches JAX's settings.
     jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # JAX has no annotations for it
     try:

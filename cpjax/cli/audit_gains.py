@@ -33,7 +33,7 @@ def add_command(commands: Any) -> None:
     )
     parser = commands.add_parser("audit-gains", help="which plant printed gains come from", description=text)
     add_options(parser, OPTIONS, out="out/audit-gains")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, many_starts=True)
 
 
 def run(given: argparse.Namespace) -> int:

@@ -36,7 +36,7 @@ def add_command(commands: Any) -> None:
     )
     parser = commands.add_parser("compare", help="the paper's gains against tuned ones", description=text)
     add_options(parser, OPTIONS, out="out/compare")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, many_starts=True)
 
 
 def run(given: argparse.Namespace) -> int:

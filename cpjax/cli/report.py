@@ -23,7 +23,7 @@ def add_command(commands: Any) -> None:
     text = "Runs the reproduction and the audit of the paper; writes report.html, JSON and pictures beside it."
     parser = commands.add_parser("report", help="the paper, run and audited, as one HTML page", description=text)
     add_options(parser, EVALUATION_OPTIONS, out="out/report")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, many_starts=True)
 
 
 def run(given: argparse.Namespace) -> int:

@@ -19,7 +19,7 @@ def add_command(commands: Any) -> None:
     )
     parser = commands.add_parser("reproduce", help="the paper's controllers over many starts", description=text)
     add_options(parser, EVALUATION_OPTIONS, out="out/reproduce")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, many_starts=True)
 
 
 def run(given: argparse.Namespace) -> int:

@@ -75,7 +75,7 @@ def add_command(commands: Any) -> None:
     )
     parser = commands.add_parser("tune", help="a controller tuned by gradients", description=text)
     add_options(parser, OPTIONS, out="out/tune")
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, many_starts=True)
 
 
 def run(given: argparse.Namespace) -> int:
