@@ -37,6 +37,7 @@ from cpjax.sim.rollout import Trajectory, measure, rollout
 from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
 from cpjax.state import HANGING, UPRIGHT, State
+from cpjax.study.recording import read_sweep, record_sweep
 
 try:
     __version__ = version("cpjax")
@@ -86,6 +87,8 @@ __all__ = [
     "place",
     "place_polynomial",
     "preset",
+    "read_sweep",
+    "record_sweep",
     "rollout",
     "sample_starts",
     "save",

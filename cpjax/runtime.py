@@ -27,6 +27,8 @@ from cpjax.errors import InputError
 TESTED = ("0.10.2",)
 """The versions of jaxlib with which the options were tested."""
 
+_CONFIG: Any = jax.config  # its attributes have no annotations
+
 _OPTIONS = "xla_cpu_use_multi_output_fusion=true,xla_cpu_small_while_loop_byte_threshold=16777216"
 _FLAG = "--xla_backend_extra_options"
 
@@ -53,9 +55,9 @@ def configure_cpu(devices: int | None = None) -> bool:
     flags = os.environ.get("XLA_FLAGS", "")
     try:
         if "xla_force_host_platform_device_count" not in flags:
-            jax.config.update("jax_num_cpu_devices", devices)  # type: ignore[no-untyped-call]  # untyped in JAX
+            _CONFIG.update("jax_num_cpu_devices", devices)
         else:  # which of the two holds is then XLA_FLAGS; this only asks whether JAX has started
-            jax.config.update("jax_num_cpu_devices", jax.config.jax_num_cpu_devices)  # type: ignore
+            _CONFIG.update("jax_num_cpu_devices", _CONFIG.jax_num_cpu_devices)
     except RuntimeError as problem:
         message = "configure_cpu is too late: JAX has started. Call it before anything is computed with JAX"
         raise RuntimeError(message) from problem
@@ -70,8 +72,8 @@ def keep_compilations() -> Path | None:
 
     In the user's cache folder ($XDG_CACHE_HOME or ~/.cache), unless JAX's own settings name another or forbid it.
     """
-    folder = jax.config.jax_compilation_cache_dir
-    if not jax.config.jax_enable_compilation_cache:
+    folder = _CONFIG.jax_compilation_cache_dir
+    if not _CONFIG.jax_enable_compilation_cache:
         return None
     if folder is None:
         # Compiled code is for one kind of CPU; a home may be seen by several.
@@ -89,7 +91,7 @@ def keep_compilations() -> Path | None:
         ("jax_persistent_cache_min_compile_time_secs", 0.1),
         ("jax_persistent_cache_min_entry_size_bytes", 0),
     ):
-        jax.config.update(name, value)  # type: ignore[no-untyped-call]  # untyped in JAX
+        _CONFIG.update(name, value)
     return Path(folder)
 
 

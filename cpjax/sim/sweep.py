@@ -8,7 +8,7 @@ What is computed for a start does not depend on any of this.
 
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -113,8 +113,8 @@ def sweep(
         columns, shared = _split(work.leaves, work.kind.batched)
         return jax.vmap(lambda column: _one(column, shared, work.kind)[0])(columns)
     parts = []
-    for begin in work.begins():
-        parts.append(work.block(begin))
+    for begin, part in zip(work.begins(), work.blocks(work.begins()), strict=True):
+        parts.append(part)
         if progress is not None:
             progress(min(begin + work.size, work.total), work.total)
     return jax.tree.map(lambda *blocks: jnp.asarray(np.concatenate(blocks)), *parts)
@@ -141,28 +141,46 @@ class Work(NamedTuple):
     size: int
     """Starts of a block; the last one is filled up with copies of the last start."""
 
-    def begins(self) -> Iterator[int]:
+    def begins(self) -> range:
         """Where the blocks begin."""
-        return iter(range(0, self.total, self.size))
+        return range(0, self.total, self.size)
 
-    def block(self, begin: int) -> Any:
-        """The results of up to `size` starts from `begin` on, as NumPy arrays."""
-        result, flag = self._compute(begin, self.kind)
-        far = (flag & TURNED_FAR) != 0
-        if np.any(far):
-            settings = self.kind.settings._replace(turns=False)
-            in_full, _ = self._compute(begin, self.kind._replace(settings=settings))
-            result = jax.tree.map(lambda a, b: np.where(far.reshape(-1, *[1] * (a.ndim - 1)), b, a), result, in_full)
-        return jax.tree.map(lambda array: array[: self.total - begin], result)
+    def blocks(self, begins: Iterable[int]) -> Iterator[Any]:
+        """The results of up to `size` starts from each of `begins` on, as NumPy arrays.
 
-    def _compute(self, begin: int, kind: _Kind) -> tuple[Any, np.ndarray]:
+        While the caller has one, the devices work on the next.
+        """
+        waiting: tuple[int, Any] | None = None
+        for begin in begins:
+            ahead = (begin, self._compute(begin, self.kind))
+            if waiting is not None:
+                yield self._collect(*waiting)
+            waiting = ahead
+        if waiting is not None:
+            yield self._collect(*waiting)
+
+    def structure(self) -> Any:
+        """The tree that a block's results are leaves of."""
+        columns, shared = _split(self.leaves, self.kind.batched)
+        first = [column[0] for column in columns]
+        return jax.tree.structure(jax.eval_shape(lambda: _one(first, shared, self.kind)[0]))
+
+    def _compute(self, begin: int, kind: _Kind) -> Any:
+        """Results and flags of a block, still being computed."""
         members = np.minimum(np.arange(begin, begin + self.size), self.total - 1)
         columns, shared = _split(self.leaves, kind.batched)
         placed = [_place(np.asarray(column)[members], NamedSharding(kind.mesh, _SHARED_OUT)) for column in columns]
         replicated = [_place(np.asarray(leaf), NamedSharding(kind.mesh, _EVERYWHERE)) for leaf in shared]
-        results = _compiled(kind.mesh.devices.flat[0].platform)(placed, replicated, kind)
-        gathered: tuple[Any, np.ndarray] = jax.tree.map(_gather, results)
-        return gathered
+        return _compiled(kind.mesh.devices.flat[0].platform)(placed, replicated, kind)
+
+    def _collect(self, begin: int, results: Any) -> Any:
+        result, flag = jax.tree.map(_gather, results)
+        far = (flag & TURNED_FAR) != 0
+        if np.any(far):
+            settings = self.kind.settings._replace(turns=False)
+            in_full, _ = jax.tree.map(_gather, self._compute(begin, self.kind._replace(settings=settings)))
+            result = jax.tree.map(lambda a, b: np.where(far.reshape(-1, *[1] * (a.ndim - 1)), b, a), result, in_full)
+        return jax.tree.map(lambda array: array[: self.total - begin], result)
 
 
 def prepare(

@@ -1,0 +1,114 @@
+"""`cpjax sweep`: many starts, or a million, as a table, a picture and a file of all results."""
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+
+from cpjax import io
+from cpjax.cli.options import (
+    CONTROLLER_OPTIONS,
+    EVALUATION_OPTIONS,
+    PLANT_OPTIONS,
+    Option,
+    add_options,
+    build_controller,
+    build_plant,
+    resolve,
+)
+from cpjax.cli.progress import progress
+from cpjax.cli.tables import print_table
+from cpjax.sim.metrics import ProtocolMetrics
+from cpjax.starts import sample_starts
+from cpjax.study.recording import SUFFIXES, record_sweep
+from cpjax.study.summary import COSTS, summarise
+
+_FORMATS = tuple(suffix[1:] for suffix in SUFFIXES)
+
+OPTIONS = [
+    *EVALUATION_OPTIONS,
+    Option("sweep", "precision", "of all numbers (default float64)", choices=("float32", "float64")),
+    Option("sweep", "format", "of the results (default npz; parquet needs pyarrow)", choices=_FORMATS),
+    Option("sweep", "save_every", "keep every so many steps of the trajectories, instead of metrics", int),
+    *PLANT_OPTIONS,
+    *CONTROLLER_OPTIONS,
+]
+
+
+def add_command(commands: Any) -> None:
+    """Declares the command."""
+    text = (
+        "Simulates a controller from many starts, on all cores. Writes the metrics of each to metrics.npz (.parquet, "
+        ".json), sweep.json and sweep.png; or trajectories, in parts. An interrupted run goes on where it stopped."
+    )
+    parser = commands.add_parser("sweep", help="one controller from many starts", description=text)
+    add_options(parser, OPTIONS, out="out/sweep")
+    parser.set_defaults(run=run, many_starts=True)
+
+
+def run(given: argparse.Namespace) -> int:
+    """Runs the command."""
+    sections = resolve(given, OPTIONS)
+    plant = build_plant(sections["plant"])
+    controller = build_controller(sections["controller"], plant)
+    setting = {"starts": "hanging", "count": 4096, "duration": 20.0, "dt": 0.002, **sections["evaluation"]}
+    chosen = {"precision": "float64", "format": "npz", **sections["sweep"]}
+    name, count = setting.pop("starts"), setting.pop("count")
+    starts = sample_starts(name, count, seed=given.seed, dtype=np.dtype(chosen["precision"]))
+    save_every = chosen.get("save_every")
+    path = given.out / ("trajectories" if save_every is not None else f"metrics.{chosen['format']}")
+    fold = ProtocolMetrics(reference_x=sections["controller"].get("reference_x", 0.0))
+    steps = round(setting["duration"] / setting["dt"])
+    begin = time.perf_counter()
+    with progress("sweep") as report:
+
+        def tell(done: int, total: int) -> None:
+            rate = done * steps / (time.perf_counter() - begin) / 1e6
+            report(done, total, f"starts, {rate:.0f} M steps/s")
+
+        metrics = record_sweep(
+            path,
+            plant,
+            controller,
+            starts,
+            **setting,
+            clock="sampled",
+            metrics=fold,
+            save_every=save_every,
+            about={"starts": name, "seed": given.seed},
+            progress=tell,
+        )
+    seconds = time.perf_counter() - begin
+    speed = f"{count * steps / 1e6:.0f} M steps in {seconds:.1f} s, compilation and files included"
+    if metrics is None:
+        print(f"{speed}\nwrote {path}")
+        return 0
+
+    from cpjax.show.figures import save_figure
+    from cpjax.show.sweep import picture
+
+    summary = summarise(metrics)
+    document = {
+        "what": "summary of a sweep",
+        "versions": io.versions(),
+        "seed": given.seed,
+        "starts": name,
+        "run": setting,
+        "precision": chosen["precision"],
+        "plant": io.encode(plant),
+        "controller": io.encode(controller),
+        "file": path.name,
+        "seconds": seconds,
+        **summary,
+    }
+    io.write_json(given.out / "sweep.json", document)
+    save_figure(given.out / "sweep.png", picture(starts, metrics))
+    spread = summary["over_successes"]
+    rows = [(cost, *(f"{spread[cost][key]:.4g}" for key in ("mean", "median", "max"))) for cost in COSTS]
+    print_table("Over the successful runs", ("metric", "mean", "median", "max"), rows, text_columns=1)
+    low, high = (100 * bound for bound in summary["success_interval"])
+    print(f"{100 * summary['success_rate']:.2f} % of {count} starts settle ({low:.2f} to {high:.2f} %)")
+    print(speed)
+    print(f"wrote {path}, sweep.json and sweep.png")
+    return 0

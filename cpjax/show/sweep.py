@@ -1,0 +1,37 @@
+"""Pictures of a sweep."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cpjax.numeric.trigonometry import wrap_angle
+from cpjax.sim.metrics import Metrics
+from cpjax.state import State
+
+_MOST = 20_000  # dots that a picture can use
+_FAILED = "#D55E00"
+
+
+def picture(starts: State, metrics: Metrics) -> Figure:
+    """Settling time over the starts' angle and rate, and how it is distributed; failures in a colour of their own."""
+    some = slice(None, None, max(1, len(np.asarray(starts.x)) // _MOST))
+    from_hanging = np.degrees(np.asarray(wrap_angle(np.asarray(starts.theta)[some] - np.pi)))
+    rate = np.asarray(starts.theta_dot)[some]
+    times, good = np.asarray(metrics.settling_time), np.asarray(metrics.success)
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    won = good[some]
+    dots = left.scatter(from_hanging[won], rate[won], c=times[some][won], s=4, cmap="viridis", rasterized=True)
+    left.plot(from_hanging[~won], rate[~won], ".", color=_FAILED, markersize=3, label="failed")
+    left.set_xlabel("start: angle from hanging [deg]")
+    left.set_ylabel("start: angular rate [rad/s]")
+    if won.any():
+        figure.colorbar(dots, ax=left, label="settling time [s]")
+    if not won.all():
+        left.legend(frameon=False)
+    if good.any():
+        right.hist(times[good], bins=80, color="#0072B2")
+    right.set_xlabel("settling time [s]")
+    right.set_ylabel("starts")
+    right.grid(alpha=0.3)
+    figure.suptitle(f"{good.sum()} of {good.size} starts settle")
+    return figure

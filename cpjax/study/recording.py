@@ -1,0 +1,205 @@
+"""A sweep on disk: saved block by block, gone on with after an interruption, and one file in the end."""
+
+import hashlib
+import io as buffers
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+from cpjax import io
+from cpjax.controllers.protocol import Controller, Law, as_controller
+from cpjax.errors import InputError
+from cpjax.plant import CartPole
+from cpjax.sim.metrics import Fold, ProtocolMetrics
+from cpjax.sim.sweep import Progress, Work, prepare
+from cpjax.state import NAMES, State
+
+SUFFIXES = (".parquet", ".npz", ".json")
+"""Of the files that a sweep's metrics are written to."""
+
+_DOCUMENT = "cpjax"  # under which an NPZ or Parquet file holds the document
+
+
+def record_sweep(
+    path: str | Path,
+    plant: CartPole,
+    controller: Controller | Law,
+    starts: State,
+    *,
+    duration: float,
+    dt: float,
+    metrics: Fold | None = None,
+    save_every: int | None = None,
+    about: Mapping[str, Any] | None = None,
+    chunk: int | None = None,
+    block: int | None = None,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> Any:
+    """A `cpjax.sweep` whose results go to `path`, with plant, controller, settings and versions beside them.
+
+    Each block is saved when it is done, in the folder `path` + ".parts". Killed at any moment and called again with
+    the same arguments, it goes on there and ends in the identical file; the folder is then gone. With several processes
+    (`jax.distributed`) all call this, and the first writes.
+
+    Args:
+      path: ends in .parquet (needs pyarrow), .npz or .json. With `save_every`, the name of a folder without a suffix,
+        in which the blocks of trajectories stay, each an NPZ file, beside sweep.json.
+      about: plain values to keep in the file, such as the seed of the starts.
+      settings: as for `sweep`, which describes the other arguments too.
+
+    Returns:
+      What `sweep` would return, as NumPy arrays; None for trajectories, and in all processes but the first.
+
+    Raises:
+      InputError: as for `sweep`; another suffix; or a folder of parts that belongs to another sweep.
+    """
+    path = _checked_path(path, trajectories=save_every is not None)
+    fold = ProtocolMetrics() if metrics is None else metrics
+    chosen: dict[str, Any] = {"duration": duration, "dt": dt, "save_every": save_every, **settings}
+    work = prepare(plant, controller, starts, metrics=fold, chunk=chunk, block=block, **chosen)
+    document = {
+        "what": "closed-loop trajectories of many starts" if save_every else "metrics of many closed-loop runs",
+        "versions": io.versions(),
+        "about": dict(about or {}),
+        "run": {key: value for key, value in chosen.items() if value is not None},
+        "count": work.total,
+        "dtype": str(work.leaves[0].dtype),
+        "plant": io.encode(plant),
+        "controller": _described(as_controller(controller)),
+        "metrics": _described(fold),
+    }
+    folder = path if save_every else path.with_name(path.name + ".parts")
+    first = jax.process_index() == 0
+    parts = [folder / f"part-{begin:09d}-{min(begin + work.size, work.total):09d}.npz" for begin in work.begins()]
+    if first:
+        _claim(folder, {**document, "starts": _digest(work)})
+    done = np.array([part.exists() for part in parts])
+    if jax.process_count() > 1:
+        done = np.asarray(multihost_utils.broadcast_one_to_all(done))
+    computed = work.blocks(begin for begin, there in zip(work.begins(), done, strict=True) if not there)
+    for begin, part, there in zip(work.begins(), parts, done, strict=True):
+        if not there:
+            columns = _columns(next(computed))
+            if first:
+                own = _starts(work, begin, begin + work.size) if save_every else {}
+                io.write_bytes(part, _npz({**own, **columns}))
+        if progress is not None:
+            progress(min(begin + work.size, work.total), work.total)
+    if save_every or not first:
+        return None
+    return _assemble(path, folder, parts, document, work)
+
+
+def read_sweep(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The document and the columns of a file that `record_sweep` wrote: the starts, and the metrics by name.
+
+    Raises:
+      InputError: no such file, or not one of `record_sweep`'s.
+    """
+    path = _checked_path(path, trajectories=False)
+    try:
+        if path.suffix == ".json":
+            table = io.read_table(path)
+            return table["document"], {name: np.asarray(values) for name, values in table["columns"].items()}
+        if path.suffix == ".npz":
+            with np.load(path) as archive:
+                columns = dict(archive)
+            return json.loads(str(columns.pop(_DOCUMENT))), columns
+        table = _pyarrow().parquet.read_table(path)
+        columns = {name: table[name].combine_chunks().to_numpy(zero_copy_only=False) for name in table.column_names}
+        return json.loads(table.schema.metadata[_DOCUMENT.encode()]), columns
+    except (OSError, ValueError, KeyError, TypeError, EOFError) as problem:
+        if isinstance(problem, InputError):
+            raise
+        raise InputError("path", str(path), f"a file written by record_sweep ({problem})") from problem
+
+
+def _checked_path(path: Any, *, trajectories: bool) -> Path:
+    if not isinstance(path, (str, Path)):
+        raise InputError("path", path, "a file name, as str or Path")
+    path = Path(path)
+    if trajectories and path.suffix:
+        raise InputError("path", str(path), "the name of a folder, without a suffix: trajectories are written in parts")
+    if not trajectories and path.suffix not in SUFFIXES:
+        raise InputError("path", str(path), "a file name that ends in " + ", ".join(SUFFIXES))
+    if path.suffix == ".parquet":
+        _pyarrow()
+    return path
+
+
+def _pyarrow() -> Any:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as problem:
+        raise InputError("path", ".parquet", "another suffix, or pyarrow installed: pip install pyarrow") from problem
+    return pyarrow
+
+
+def _described(component: Any) -> Any:
+    return io.encode(component) if type(component) in io.TYPES.values() else type(component).__name__
+
+
+def _claim(folder: Path, request: dict[str, Any]) -> None:
+    """Makes the folder this sweep's, or sees that it is."""
+    path = folder / "sweep.json"
+    asked = io.dump_json(request)
+    if path.exists() and path.read_text(encoding="utf-8") != asked:
+        allowed = "a place without the parts of another sweep (other arguments, starts or versions); delete them first"
+        raise InputError("path", str(folder), allowed)
+    if not path.exists():
+        io.write_text(path, asked)
+
+
+def _digest(work: Work) -> str:
+    """A fingerprint of all numbers that go in."""
+    digest = hashlib.sha256()
+    for leaf in work.leaves:
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def _starts(work: Work, begin: int, end: int) -> dict[str, np.ndarray]:
+    columns = zip(NAMES, work.leaves, strict=False)  # the start's leaves come first
+    return {f"start.{name}": np.asarray(column)[begin:end] for name, column in columns}
+
+
+def _columns(result: Any) -> dict[str, np.ndarray]:
+    leaves = jax.tree_util.tree_leaves_with_path(result)
+    return {jax.tree_util.keystr(key, simple=True, separator=".") or "result": leaf for key, leaf in leaves}
+
+
+def _npz(columns: Mapping[str, Any]) -> bytes:
+    buffer = buffers.BytesIO()
+    np.savez(buffer, **columns)
+    return buffer.getvalue()
+
+
+def _assemble(path: Path, folder: Path, parts: list[Path], document: dict[str, Any], work: Work) -> Any:
+    """One file of all parts, which are then deleted."""
+    loaded = []
+    for part in parts:
+        with np.load(part) as archive:
+            loaded.append(dict(archive))
+    results = {name: np.concatenate([one[name] for one in loaded]) for name in loaded[0]}
+    columns = {**_starts(work, 0, work.total), **results}
+    if path.suffix == ".json":
+        io.write_json(path, {"document": document, "columns": columns})
+    elif path.suffix == ".npz":
+        io.write_bytes(path, _npz({_DOCUMENT: np.asarray(io.dump_json(document)), **columns}))
+    else:
+        arrow = _pyarrow()
+        table = arrow.table({name: column if column.ndim == 1 else column.tolist() for name, column in columns.items()})
+        table = table.replace_schema_metadata({_DOCUMENT: io.dump_json(document)})
+        buffer = buffers.BytesIO()
+        arrow.parquet.write_table(table, buffer)
+        io.write_bytes(path, buffer.getvalue())
+    shutil.rmtree(folder)
+    return jax.tree.unflatten(work.structure(), list(results.values()))
