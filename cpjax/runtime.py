@@ -61,7 +61,7 @@ def configure_cpu(devices: int | None = None) -> bool:
     except RuntimeError as problem:
         message = "configure_cpu is too late: JAX has started. Call it before anything is computed with JAX"
         raise RuntimeError(message) from problem
-    if version("jaxlib") not in TESTED or _FLAG in flags:
+    if not is_tested() or _FLAG in flags:
         return False
     os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}={_OPTIONS}".strip()
     return True
@@ -117,6 +117,12 @@ def fast_loops() -> bool:
     # 64 KiB: by default only loops over less than 1 KiB are made one function.
     text = jax.jit(loop).lower(jnp.zeros((1 << 14,), jnp.float32)).compile().as_text() or ""
     return "xla_cpu_small_call" in text
+
+
+@functools.cache
+def is_tested() -> bool:
+    """Whether jaxlib is a version with which all that XLA does not document was tested."""
+    return version("jaxlib") in TESTED
 
 
 def compiler_options(platform: str) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +43,6 @@ def located_rate(
     found: Metrics = sweep(plant, controller, some, duration=duration, dt=0.002, switching="located", metrics=metrics)
     good = np.asarray(found.success)
     return float(np.mean(good)), float(np.mean(np.asarray(found.settling_time)[good])) if good.any() else math.nan
-
-
-def use_fast_gradients() -> None:
-    """Sets an option of XLA's that about doubles the speed of the gradients. Before JAX computes anything."""
-    os.environ.setdefault("XLA_FLAGS", "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true")
 
 
 def tuned(out: Path, case: str, plant: CartPole, free: FreeParameters, plan: Plan) -> tuple[Hybrid, dict[str, Any]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from _common import run
-from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned, use_fast_gradients
+from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned
 
 from cpjax import io, paper
 from cpjax.presets import preset
@@ -52,5 +52,4 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
-    use_fast_gradients()
     run(main, __doc__ or "")

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from _common import run
-from _tuned import EVALUATION_SEED, QUICK, tuned, use_fast_gradients
+from _tuned import EVALUATION_SEED, QUICK, tuned
 
 from cpjax import io, paper
 from cpjax.controllers import Hybrid
@@ -94,5 +94,4 @@ _sampled = jax.jit(functools.partial(_evaluated, clock="sampled"))
 _located = jax.jit(functools.partial(_evaluated, switching="located"))
 
 if __name__ == "__main__":
-    use_fast_gradients()
     run(main, __doc__ or "")

@@ -15,7 +15,7 @@ from typing import Any, get_args
 import jax
 import numpy as np
 from _common import run
-from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned, use_fast_gradients
+from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned
 
 from cpjax import io, paper
 from cpjax.controllers import Hybrid, StateFeedback
@@ -93,5 +93,4 @@ def judge(plant: CartPole, controller: Hybrid, count: int) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    use_fast_gradients()
     run(main, __doc__ or "")

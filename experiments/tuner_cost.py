@@ -33,7 +33,7 @@ from cpjax.tune.plan import Plan
 from cpjax.tune.starting import beginning
 
 FUSION, LOOPS = "xla_cpu_use_multi_output_fusion=true", "xla_cpu_small_while_loop_byte_threshold=16777216"
-OPTIONS = {"none": "", "fusion": FUSION, "fusion and small loops": f"{FUSION},{LOOPS}"}
+OPTIONS = {"none": "", "fusion and small loops": f"{FUSION},{LOOPS}"}
 WORK = ("values", "gradients")
 
 

@@ -12,6 +12,7 @@ EXPERIMENTS = sorted(path for path in FOLDER.glob("*.py") if not path.name.start
 
 SLOW = {  # a minute of compiling each, or what the package's own tests hold anyway
     "accuracy",
+    "benchmark",
     "benchmark_design",
     "gradient_accuracy",
     "gradient_cost",

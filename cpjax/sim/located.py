@@ -5,6 +5,7 @@ voltage reaches the limit, the vector field has a kink, over which a Runge-Kutta
 derivatives with it.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -12,8 +13,10 @@ import jax.numpy as jnp
 
 from cpjax.controllers.protocol import SmoothController
 from cpjax.plant import CartPole
+from cpjax.sim.compilation import one_function, part_of_step
 from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, Flag, unknown
 from cpjax.sim.integrators import INTEGRATORS, Integrator
+from cpjax.sim.kept import pack
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
@@ -31,33 +34,47 @@ class _Loop(NamedTuple):
 
 def simulate(
     start: State, plant: CartPole, controller: SmoothController, fold: Fold, dt: jax.Array, settings: Settings
-) -> tuple[Sample | None, Sample, Any]:
-    """The samples that are kept (None if none are), the last one, and what the fold made of all of them."""
-    system, integrator = ClosedLoop(plant, controller), INTEGRATORS[settings.integrator]
-    steps, iterations = settings.steps, settings.steps + settings.spare_steps
+) -> tuple[jax.Array | None, Sample, Any]:
+    """The samples that are kept but for the last, packed (None if none are), the last one, and what the fold made of
+    all of them."""
+    system = ClosedLoop(plant, controller)
     motion = start_motion(system, (start.x, start.theta), (start.x_dot, start.theta_dot), system.start_mode(start), dt)
     loop = _Loop(motion, unknown((start, plant, controller)))
     first = _sample(loop, motion, dt)
-    memory = fold.update(fold.init(first), first)
 
-    def body(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], tuple[Sample, jax.Array] | None]:
-        before, memory = carry
-        loop, reached = _advance(system, integrator, before, dt, steps, iterations - index)
-        sample = _sample(loop, before.motion, dt)
-        memory = jax.tree.map(lambda new, old: jnp.where(reached, new, old), fold.update(memory, sample), memory)
-        return (loop, memory), (None if settings.save_every is None else (sample, loop.motion.passed))
-
-    carry, kept = scan(body, (loop, memory), jnp.arange(iterations, dtype=jnp.int32), settings.checkpoint)
+    run = one_function(functools.partial(_run, settings=settings), stacks=True)
+    carry, kept = run((loop, fold.update(fold.init(first), first)), system, fold, dt)
     loop, memory = carry
     last = _sample(loop, loop.motion, dt)
     samples = None
     if kept is not None:
         samples, passed = kept
         # The first iteration after which so many grid points have been passed.
-        wanted = jnp.arange(settings.save_every, steps + 1, settings.save_every, dtype=passed.dtype)
+        wanted = jnp.arange(settings.save_every, settings.steps, settings.save_every, dtype=passed.dtype)
         rows = jnp.searchsorted(passed, wanted)
-        samples = jax.tree.map(lambda one, many: jnp.concatenate([one[None], many[rows]]), first, samples)
+        samples = jnp.concatenate([pack(first)[None], samples[rows]])
     return samples, last, fold.finish(memory, last)
+
+
+def _run(
+    carry: tuple[_Loop, Any], system: ClosedLoop, fold: Fold, dt: jax.Array, settings: Settings
+) -> tuple[tuple[_Loop, Any], tuple[jax.Array, jax.Array] | None]:
+    """Loop and memory after all iterations; and, of each, its sample, packed, and how many grid points it has passed,
+    if samples are kept."""
+    integrator, steps = INTEGRATORS[settings.integrator], settings.steps
+    iterations = steps + settings.spare_steps
+
+    def body(
+        carry: tuple[_Loop, Any], index: jax.Array
+    ) -> tuple[tuple[_Loop, Any], tuple[jax.Array, jax.Array] | None]:
+        before, memory = carry
+        loop, reached = _advance(system, integrator, before, dt, steps, iterations - index)
+        sample = _sample(loop, before.motion, dt)
+        updated = part_of_step(type(fold).update)(fold, memory, sample)
+        memory = jax.tree.map(lambda new, old: jnp.where(reached, new, old), updated, memory)
+        return (loop, memory), (None if settings.save_every is None else (pack(sample), loop.motion.passed))
+
+    return scan(body, carry, jnp.arange(iterations, dtype=jnp.int32), settings.checkpoint)
 
 
 def _sample(loop: _Loop, before: Motion, dt: jax.Array) -> Sample:

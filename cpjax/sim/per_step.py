@@ -3,20 +3,24 @@
 At each step `_observe` reads the controller and takes a sample, `_advance` integrates to the next.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from cpjax import runtime
 from cpjax.controllers.protocol import Controller
 from cpjax.numeric.trigonometry import LARGEST_TURN, sin_cos
 from cpjax.plant import CartPole
+from cpjax.sim.compilation import one_function, part_of_step
 from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, TURNED_FAR, Flag, unknown
 from cpjax.sim.integrators import INTEGRATORS
+from cpjax.sim.kept import pack
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
-from cpjax.sim.stepper import Pair, applied_voltage, step_continuous, step_held, step_held_by_turns
+from cpjax.sim.stepper import Pair, applied_voltage, rates, step_continuous, step_held, step_held_by_turns
 from cpjax.state import ANGLE_LIMIT, RUNAWAY_LIMIT, State
 
 
@@ -42,38 +46,48 @@ class _Loop(NamedTuple):
 
 def simulate(
     start: State, plant: CartPole, controller: Controller, fold: Fold, dt: jax.Array, settings: Settings
-) -> tuple[Sample | None, Sample, Any]:
-    """The samples that are kept (None if none are), the last one, and what the fold made of all of them."""
-    steps, every = settings.steps, settings.save_every
+) -> tuple[jax.Array | None, Sample, Any]:
+    """The samples that are kept but for the last, packed (None if none are), the last one, and what the fold made of
+    all of them."""
     none = jnp.zeros_like(start.x, dtype=jnp.int32)
     mode = controller.start_mode(start)
     voltage = applied_voltage(plant, controller, start, mode)
     loop = _Loop(start, mode, voltage, unknown((start, plant, controller)), none)
     _, first, _ = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
 
-    def body(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], Sample | None]:
-        loop, memory = carry
-        loop, sample, instant = _observe(plant, controller, loop, index, dt, settings)
-        memory = fold.update(memory, sample)
-        loop = _advance(plant, controller, loop, instant, dt, settings)
-        return (loop, memory), (sample if every == 1 else None)
-
-    def block(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], Sample]:
-        _, sample, _ = _observe(plant, controller, carry[0], index, dt, settings)
-        carry, _ = scan(body, carry, index + jnp.arange(every), "every_step")
-        return carry, sample
-
     carry = (loop, fold.init(first))
-    if every is None or every == 1:
-        carry, samples = scan(body, carry, jnp.arange(steps), settings.checkpoint)
-    else:
-        carry, samples = scan(block, carry, jnp.arange(0, steps, every), "every_step")
-    loop, memory = carry
-    _, last, _ = _observe(plant, controller, loop, jnp.asarray(steps), dt, settings)
-    if samples is not None:
-        samples = jax.tree.map(lambda many, one: jnp.concatenate([many, one[None]]), samples, last)
+    run = one_function(functools.partial(_run, settings=settings), stacks=True)
+    (loop, memory), samples = run(carry, plant, controller, fold, dt)
+    _, last, _ = _observe(plant, controller, loop, jnp.asarray(settings.steps), dt, settings)
     clean = last._replace(flag=last.flag & ~TURNED_FAR)
     return samples, last, fold.finish(fold.update(memory, clean), clean)
+
+
+def _run(
+    carry: tuple[_Loop, Any], plant: CartPole, controller: Controller, fold: Fold, dt: jax.Array, settings: Settings
+) -> tuple[tuple[_Loop, Any], jax.Array | None]:
+    """Loop and memory after all steps, and the samples that are kept but for the last."""
+    steps, every = settings.steps, settings.save_every
+
+    def body(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], jax.Array | None]:
+        loop, memory = carry
+        loop, sample, instant = _observe(plant, controller, loop, index, dt, settings)
+        memory = part_of_step(type(fold).update)(fold, memory, sample)
+        loop = _advance(plant, controller, loop, instant, dt, settings)
+        return (loop, memory), (pack(sample) if every == 1 else None)
+
+    def block(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], jax.Array]:
+        _, sample, _ = _observe(plant, controller, carry[0], index, dt, settings)
+        carry, _ = scan(body, carry, index + jnp.arange(every), "every_step")
+        return carry, pack(sample)
+
+    if every is None:
+        # With these options of the compiler, all that is remembered would be copied at each step.
+        checkpoint = "segments" if runtime.fast_loops() else settings.checkpoint
+        return scan(body, carry, jnp.arange(steps), checkpoint)
+    if every == 1:
+        return scan(body, carry, jnp.arange(steps), "every_step")
+    return scan(block, carry, jnp.arange(0, steps, every), "every_step")
 
 
 def _observe(
@@ -95,9 +109,8 @@ def _observe(
             voltage = jnp.where(instant, voltage, loop.voltage)
             changes = jnp.where(instant, changes, loop.changes)
     flag = loop.flag | jnp.where(changes >= CHATTER_LENGTH, int(Flag.CHATTERING), 0)
-    sin, cos = sin_cos(state.theta)
-    force = plant.motor.force(voltage, state.x_dot)
-    rates = plant.acceleration(sin, cos, (state.x_dot, state.theta_dot), force)
+    direction = sin_cos(state.theta)
+    accelerations = part_of_step(rates)(plant, direction, (state.x_dot, state.theta_dot), voltage)
     sample = Sample(
         time=index.astype(dt.dtype) * dt,
         elapsed=jnp.where((index > 0) & ((flag & STOPPED) == 0), dt, 0.0),
@@ -105,12 +118,12 @@ def _observe(
         voltage=voltage,
         voltage_before=voltage_before,
         mode=mode,
-        cart_acceleration=jnp.asarray(rates[0]),
+        cart_acceleration=jnp.asarray(accelerations[0]),
         flag=flag,
         crossing=jnp.zeros_like(mode),
         crossing_speed=jnp.zeros_like(voltage),
     )
-    return _Loop(state, mode, voltage, flag, changes), sample, _Instant(rates, (sin, cos))
+    return _Loop(state, mode, voltage, flag, changes), sample, _Instant(accelerations, direction)
 
 
 def _advance(
@@ -124,18 +137,18 @@ def _advance(
     still gives NaN derivatives; those of this library are finite.)
     """
     state, method, far = loop.state, INTEGRATORS[settings.integrator], jnp.zeros_like(loop.flag)
-    rates, direction = instant
+    first, direction = instant
     stopped = (loop.flag & STOPPED) != 0
-    ahead = jnp.maximum(jnp.abs(state.x_dot + dt * rates[0]), jnp.abs(state.theta_dot + dt * rates[1]))
+    ahead = jnp.maximum(jnp.abs(state.x_dot + dt * first[0]), jnp.abs(state.theta_dot + dt * first[1]))
     going = ~stopped & (ahead <= RUNAWAY_LIMIT)
-    safe, safe_rates = jax.tree.map(lambda value: jnp.where(going, value, 0.0), (state, rates))
+    safe, safe_first = jax.tree.map(lambda value: jnp.where(going, value, 0.0), (state, first))
     if settings.turns:  # values only, so nothing has to be safe
-        after, turn = step_held_by_turns(plant, method, state, direction, loop.voltage, dt, rates)
+        after, turn = step_held_by_turns(plant, method, state, direction, loop.voltage, dt, first)
         far = jnp.where(going & (turn > LARGEST_TURN), TURNED_FAR, 0)
     elif settings.clock == "continuous":
-        after = step_continuous(plant, controller, method, safe, loop.mode, dt, safe_rates)
+        after = step_continuous(plant, controller, method, safe, loop.mode, dt, safe_first)
     else:
-        after = step_held(plant, method, safe, jnp.where(going, loop.voltage, 0.0), dt, safe_rates)
+        after = step_held(plant, method, safe, jnp.where(going, loop.voltage, 0.0), dt, safe_first)
     fastest = jnp.maximum(jnp.abs(after.x_dot), jnp.abs(after.theta_dot))
     within = (jnp.maximum(jnp.abs(after.x), fastest) <= RUNAWAY_LIMIT) & (jnp.abs(after.theta) <= ANGLE_LIMIT)
     good = going & within

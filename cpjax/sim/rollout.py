@@ -18,7 +18,8 @@ from cpjax.plant import CartPole
 from cpjax.pytree import cast, check, pytree
 from cpjax.sim import located, per_step
 from cpjax.sim.flags import TURNED_FAR
-from cpjax.sim.metrics import Fold, ProtocolMetrics
+from cpjax.sim.kept import Kept, fields, keep
+from cpjax.sim.metrics import Fold, ProtocolMetrics, Sample
 from cpjax.sim.settings import Checkpoint, Clock, Settings, Switching, check_settings
 from cpjax.state import State, checked_start
 
@@ -59,7 +60,7 @@ def rollout(
     integrator: str = "rk4",
     save_every: int = 1,
     spare_steps: int | None = None,
-    checkpoint: Checkpoint = "every_step",
+    checkpoint: Checkpoint = "segments",
     metrics: Fold | None = None,
 ) -> Trajectory:
     """Simulates the closed loop from one start. Works under `jit`, `vmap` and differentiation.
@@ -82,9 +83,9 @@ def rollout(
       save_every: keep every so many steps; must divide the number of steps.
       spare_steps: of located switching, whose crossings take four steps each: the most that they may take together. A
         run that needs more is stopped and flagged. By default 64 and a sixteenth of the steps.
-      checkpoint: what reverse mode remembers: the state at "every_step", or at the ends of "segments" of about
-        sqrt(n) steps, which takes less memory and a little more time. Nothing else depends on it. (With switching per
-        step and `save_every` above 1 it remembers the saved states, whatever is asked for.)
+      checkpoint: what reverse mode remembers: the state at the ends of "segments" of about sqrt(n) steps, or at
+        "every_step", which takes more memory. Nothing else depends on it. (With switching per step and `save_every`
+        it remembers the saved states, whatever is asked for, and after `cpjax.configure_cpu` always "segments".)
       metrics: a fold over all steps; by default `ProtocolMetrics()`.
 
     Raises:
@@ -113,7 +114,7 @@ def measure(
     switching: Switching = "per_step",
     integrator: str = "rk4",
     spare_steps: int | None = None,
-    checkpoint: Checkpoint = "every_step",
+    checkpoint: Checkpoint = "segments",
     metrics: Fold | None = None,
 ) -> Any:
     """What `rollout(...).metrics` would be, without storing a trajectory. Arguments and errors as for `rollout`."""
@@ -125,27 +126,24 @@ def measure(
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _simulate(start: State, plant: CartPole, controller: Any, fold: Fold, dt: jax.Array, *, settings: Settings) -> Any:
-    return simulate(start, plant, controller, fold, dt, settings)[0]
+    return results(*simulate(start, plant, controller, fold, dt, settings))
 
 
 def simulate(
     start: State, plant: CartPole, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
-) -> tuple[Any, jax.Array]:
-    """Trajectory, or only what the fold made of it, and the last flag; of arguments that have been checked and cast."""
+) -> tuple[Kept | None, Sample, Any]:
+    """Of arguments that have been checked and cast: what is kept of all samples but the last (None if nothing is), the
+    last one (its flag may have TURNED_FAR), and what the fold made of all of them."""
     one = located.simulate if settings.switching == "located" else per_step.simulate
-    samples, last, result = one(start, plant, controller, fold, dt, settings)
-    if samples is None:
-        return result, last.flag
-    trajectory = Trajectory(
-        time=samples.time,
-        state=samples.state,
-        voltage=samples.voltage,
-        mode=samples.mode,
-        cart_acceleration=samples.cart_acceleration,
-        flag=last.flag & ~TURNED_FAR,
-        metrics=result,
-    )
-    return trajectory, last.flag
+    packed, last, result = one(start, plant, controller, fold, dt, settings)
+    return (None if packed is None else keep(packed, plant)), last, result
+
+
+def results(kept: Kept | None, last: Sample, result: Any) -> Any:
+    """What users get of what `simulate` returned: a `Trajectory`, or only what the fold made of it."""
+    if kept is None:
+        return result
+    return Trajectory(**fields(kept, last), flag=last.flag & ~TURNED_FAR, metrics=result)  # type: ignore[arg-type]
 
 
 def _without_designs(controller: Any) -> Any:

@@ -38,7 +38,7 @@ def check_settings(
     integrator: Any,
     save_every: Any,
     spare_steps: Any = None,
-    checkpoint: Checkpoint = "every_step",
+    checkpoint: Checkpoint = "segments",
 ) -> Settings:
     """The settings of a rollout; `save_every` None for metrics only.
 

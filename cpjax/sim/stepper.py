@@ -9,6 +9,7 @@ from cpjax.controllers.protocol import Controller, SmoothController
 from cpjax.numeric.trigonometry import sin_cos, turned
 from cpjax.plant import CartPole
 from cpjax.pytree import Scalar
+from cpjax.sim.compilation import part_of_step
 from cpjax.sim.integrators import Acceleration, Integrator
 from cpjax.sim.switching import Observation
 from cpjax.state import State
@@ -22,6 +23,16 @@ def applied_voltage(plant: CartPole, controller: Controller, state: State, mode:
     return plant.motor.saturate(jnp.asarray(demand, dtype=jnp.asarray(state.x).dtype))
 
 
+def rates(plant: CartPole, direction: Pair, v: Pair, voltage: Scalar) -> Pair:
+    """(x'', theta'') [m/s^2, rad/s^2] under an applied `voltage` [V].
+
+    Args:
+      direction: sine and cosine of theta.
+      v: (x', theta') [m/s, rad/s].
+    """
+    return plant.acceleration(*direction, v, plant.motor.force(voltage, v[0]))
+
+
 def step_held(
     plant: CartPole, integrator: Integrator, state: State, voltage: Scalar, dt: Scalar, first: Pair | None = None
 ) -> State:
@@ -32,8 +43,7 @@ def step_held(
     """
 
     def acceleration(q: Pair, v: Pair) -> Pair:
-        sin, cos = sin_cos(q[1])
-        return plant.acceleration(sin, cos, v, plant.motor.force(voltage, v[0]))
+        return part_of_step(rates)(plant, sin_cos(q[1]), v, voltage)
 
     return _integrate(integrator, acceleration, state, dt, first)
 
@@ -61,8 +71,8 @@ def step_held_by_turns(
         nonlocal largest
         turn = jnp.asarray(q[1] - state.theta)
         largest = jnp.maximum(largest, jnp.abs(turn))
-        sin, cos = turned(jnp.asarray(direction[0]), jnp.asarray(direction[1]), turn)
-        return plant.acceleration(sin, cos, v, plant.motor.force(voltage, v[0]))
+        turned_to = turned(jnp.asarray(direction[0]), jnp.asarray(direction[1]), turn)
+        return part_of_step(rates)(plant, turned_to, v, voltage)
 
     return _integrate(integrator, acceleration, state, dt, first), largest
 
@@ -83,9 +93,8 @@ def step_continuous(
     """
 
     def acceleration(q: Pair, v: Pair) -> Pair:
-        sin, cos = sin_cos(q[1])
         voltage = applied_voltage(plant, controller, _state(q, v), mode)
-        return plant.acceleration(sin, cos, v, plant.motor.force(voltage, v[0]))
+        return part_of_step(rates)(plant, sin_cos(q[1]), v, voltage)
 
     return _integrate(integrator, acceleration, state, dt, first)
 
@@ -131,8 +140,7 @@ class ClosedLoop(NamedTuple):
             self._of_state(self.controller.margin(state, mode.law), state),
         )
         voltage = jnp.where(mode.clip == 0, demand, jnp.where(mode.clip > 0, limit, -limit))
-        sin, cos = sin_cos(q[1])
-        acceleration = self.plant.acceleration(sin, cos, v, self.plant.motor.force(voltage, v[0]))
+        acceleration = part_of_step(rates)(self.plant, sin_cos(q[1]), v, voltage)
         return Observation(acceleration, guards, voltage)
 
     def jump(self, q: Pair, v: Pair, mode: Mode, guard: jax.Array) -> tuple[Pair, Pair, Mode]:

@@ -23,8 +23,9 @@ from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.pytree import is_traced
 from cpjax.sim.flags import TURNED_FAR
-from cpjax.sim.metrics import Fold
-from cpjax.sim.rollout import cast_arguments, simulate
+from cpjax.sim.kept import Kept
+from cpjax.sim.metrics import Fold, Sample
+from cpjax.sim.rollout import cast_arguments, results, simulate
 from cpjax.sim.settings import Checkpoint, Clock, Settings, Switching, check_settings
 from cpjax.state import State, checked_start
 
@@ -32,10 +33,7 @@ Progress = Callable[[int, int], None]
 """Called with the number of starts done and their total."""
 
 _CHUNK = 128
-"""Starts at a time on a CPU where a loop is one compiled function: their state stays in the first cache."""
-
-_CHUNK_OF_SLOW_LOOPS = 4096
-"""On a CPU where each part of a step is a function: enough to make up for the calls."""
+"""Starts at a time on a CPU: their state stays in the first cache."""
 
 _VECTOR = 16
 """Numbers of float32 in the longest vectors of a CPU."""
@@ -45,6 +43,9 @@ _STEPS_PER_BLOCK = 1 << 28
 
 _LARGEST_BLOCK = 1 << 30
 """Bytes of results."""
+
+_LARGEST_BLOCK_OF_A_CPU = 1 << 26
+"""Small enough for the memory of one block to serve the next: fresh memory is slower than a simulation."""
 
 _AXIS = "starts"
 _SHARED_OUT: Any = PartitionSpec(_AXIS)  # type: ignore[no-untyped-call]  # untyped in JAX
@@ -64,7 +65,7 @@ def sweep(
     integrator: str = "rk4",
     save_every: int | None = None,
     spare_steps: int | None = None,
-    checkpoint: Checkpoint = "every_step",
+    checkpoint: Checkpoint = "segments",
     metrics: Fold | None = None,
     chunk: int | None = None,
     block: int | None = None,
@@ -111,7 +112,7 @@ def sweep(
     )
     if any(is_traced(leaf) for leaf in work.leaves):
         columns, shared = _split(work.leaves, work.kind.batched)
-        return jax.vmap(lambda column: _one(column, shared, work.kind)[0])(columns)
+        return jax.vmap(lambda column: results(*_one(column, shared, work.kind)))(columns)
     parts = []
     for begin, part in zip(work.begins(), work.blocks(work.begins()), strict=True):
         parts.append(part)
@@ -163,7 +164,7 @@ class Work(NamedTuple):
         """The tree that a block's results are leaves of."""
         columns, shared = _split(self.leaves, self.kind.batched)
         first = [column[0] for column in columns]
-        return jax.tree.structure(jax.eval_shape(lambda: _one(first, shared, self.kind)[0]))
+        return jax.tree.structure(jax.eval_shape(lambda: results(*_one(first, shared, self.kind))))
 
     def _compute(self, begin: int, kind: _Kind) -> Any:
         """Results and flags of a block, still being computed."""
@@ -199,7 +200,7 @@ def prepare(
     integrator: str = "rk4",
     save_every: int | None = None,
     spare_steps: int | None = None,
-    checkpoint: Checkpoint = "every_step",
+    checkpoint: Checkpoint = "segments",
 ) -> Work:
     """Checks a sweep's arguments and divides its starts into blocks; arguments and errors of `sweep`."""
     for name, value in (("chunk", chunk), ("block", block)):
@@ -226,13 +227,13 @@ def _sizes(
     """Starts of a chunk, and of a block: as many chunks for each device."""
     on_cpu = devices[0].platform == "cpu"
     saved = 0 if settings.save_every is None else settings.steps // settings.save_every + 1
-    most = _LARGEST_BLOCK // (itemsize * 8 * (saved + 2))
+    most = (_LARGEST_BLOCK_OF_A_CPU if on_cpu else _LARGEST_BLOCK) // (itemsize * 8 * (saved + 2))
     if on_cpu:
         most = min(most, _STEPS_PER_BLOCK // (settings.steps + settings.spare_steps))
     most = max(1, (most if block is None else block) // len(devices))
     share = math.ceil(total / len(devices))
     if chunk is None:
-        best = (_CHUNK if runtime.fast_loops() else _CHUNK_OF_SLOW_LOOPS) if on_cpu else most
+        best = _CHUNK if on_cpu else most
         chunk = min(best, _VECTOR * math.ceil(share / _VECTOR))  # whole vectors, and a few starts make no whole chunk
     chunk = min(chunk, most)
     chunks = math.ceil(share / chunk)
@@ -245,8 +246,8 @@ def _split(leaves: list[Any], batched: tuple[bool, ...]) -> tuple[list[Any], lis
     return columns, [leaf for leaf, many in zip(leaves, batched, strict=True) if not many]
 
 
-def _one(column: list[Any], shared: list[Any], kind: _Kind) -> tuple[Any, jax.Array]:
-    """The result of one start, and its flag."""
+def _one(column: list[Any], shared: list[Any], kind: _Kind) -> tuple[Kept | None, Sample, Any]:
+    """What `simulate` returns, of one start."""
     columns, others = iter(column), iter(shared)
     leaves = [next(columns) if many else next(others) for many in kind.batched]
     start, (plant, controller, fold, dt) = jax.tree.unflatten(kind.structure, leaves)
@@ -256,11 +257,13 @@ def _one(column: list[Any], shared: list[Any], kind: _Kind) -> tuple[Any, jax.Ar
 def _block(columns: list[jax.Array], shared: list[jax.Array], kind: _Kind) -> Any:
     def share(columns: list[jax.Array], shared: list[jax.Array]) -> Any:
         def chunk(column: list[jax.Array]) -> Any:
-            return jax.vmap(lambda lane: _one(lane, shared, kind))(column)
+            return jax.vmap(lambda lane: _one(lane, shared, kind), out_axes=(1, 0, 0))(column)
 
         chunks = [column.reshape(-1, kind.chunk, *column.shape[1:]) for column in columns]
-        results = jax.lax.map(chunk, chunks)
-        return jax.tree.map(lambda result: result.reshape(-1, *result.shape[2:]), results)
+        kept, last, result = jax.lax.map(chunk, chunks)
+        kept = jax.tree.map(lambda part: jnp.moveaxis(part, 1, 0), kept)  # rows first
+        trees = results(kept, last, result), last.flag
+        return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), trees)
 
     specs = {"in_specs": (_SHARED_OUT, _EVERYWHERE), "out_specs": _SHARED_OUT}
     return jax.shard_map(share, mesh=kind.mesh, check_vma=False, **specs)(columns, shared)
