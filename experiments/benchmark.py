@@ -1,0 +1,155 @@
+"""How fast cpjax is on this machine, against hand-written C and against other ways to simulate many starts.
+
+    python experiments/benchmark.py
+
+Every contender runs in a process of its own (`benchmark/contenders.py`), on the same cores, one after another; the
+best of three runs counts. C needs a C compiler; numba
+and diffrax are optional (`pip install numba diffrax`): what is missing is named. Ratios are to the C code at the same
+precision, which does the same work as cpjax (law, kick, gate, flags and all metrics); the others do less, as
+`contenders.py` says of each. Measured and written after each contender: benchmark.json, benchmark.png.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from _common import run
+from matplotlib.figure import Figure
+
+from cpjax import io
+from cpjax.cli.tables import print_table
+from cpjax.show.figures import save_figure
+
+CONTENDERS = Path(__file__).with_name("benchmark") / "contenders.py"
+CORES, ROUNDS = 2, 1
+STEPS = 5000
+DTYPES = ("float32", "float64")
+
+# Starts of each contender, both precisions: as many as it does in seconds.
+MAIN: dict[str, tuple[int, ...]] = {
+    "C": (4096, 65536),
+    "cpjax": (4096, 65536),
+    "cpjax, no options": (4096, 65536),
+    "cpjax, every 10th sample": (65536,),
+    "numba": (4096,),
+    "plain JAX scan": (4096,),
+    "diffrax, Heun": (4096,),
+    "diffrax, Tsit5": (1024,),
+}
+# In float64 only: number of starts, steps, cores.
+OTHERS: dict[str, tuple[int, int, int]] = {
+    "C, one start": (1, STEPS, 1),
+    "cpjax, one start": (1, STEPS, 1),
+    "cpjax, values of 64": (64, STEPS, 1),
+    "cpjax, gradient": (64, STEPS, 1),
+    "cpjax, gradient, every step": (64, STEPS, 1),
+    "python-control": (2, STEPS, 1),
+    "SciPy": (1, 1000, 1),
+}
+GROWTH = tuple(4**k for k in range(12))
+"""1 to 4,194,304 starts; 1,000 steps each."""
+
+
+def measured(name: str, dtype: str, count: int, steps: int, cores: int, seed: int, repeats: int) -> dict[str, Any]:
+    """One run of a contender; with "problem" where it has none of its libraries, or failed."""
+    configured = name.startswith("cpjax") and "no options" not in name and ("sample" in name or name == "cpjax")
+    numbers = {"dtype": dtype, "starts": count, "steps": steps, "seed": seed, "cores": cores, "repeats": repeats}
+    command = [sys.executable, str(CONTENDERS), name] + ["--configured"] * configured
+    command += [f"--{key}={value}" for key, value in numbers.items()]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        return {"name": name, **numbers, "problem": (done.stderr.strip().splitlines() or ["no message"])[-1][:200]}
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
+    """Prints the table, writes benchmark.json and benchmark.png."""
+    rounds, repeats = (1, 1) if quick else (ROUNDS, 3)
+    shrink = 64 if quick else 1
+    jobs = [
+        (name, dtype, max(1, count // shrink), STEPS // min(shrink, 10), CORES)
+        for name, counts in MAIN.items()
+        for count in counts
+        for dtype in DTYPES
+    ]
+    jobs += [
+        (name, "float64", count, steps // min(shrink, 10), cores) for name, (count, steps, cores) in OTHERS.items()
+    ]
+    jobs += [("cpjax", dtype, 65536 // shrink, STEPS // min(shrink, 10), 1) for dtype in DTYPES]
+    jobs += [
+        (name, "float32", count, 1000, CORES) for count in GROWTH[: 3 if quick else None] for name in ("C", "cpjax")
+    ]
+    best: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for number in range(rounds):
+        for place, job in enumerate(jobs):
+            print(f"round {number + 1} of {rounds}, {place + 1} of {len(jobs)}: {job}", file=sys.stderr, flush=True)
+            few = 1 if job[2] * job[3] > 1e9 else repeats
+            found = measured(*job, seed=seed, repeats=few)
+            before = best.get(job)
+            if before is None or found.get("steps_per_second", 0.0) > before.get("steps_per_second", 0.0):
+                best[job] = found
+            _write(out, list(best.values()))
+    rows = list(best.values())
+    _table(rows)
+    _picture(out / "benchmark.png", rows)
+    print(f"written: {out / 'benchmark.json'}, {out / 'benchmark.png'}")
+    return rows
+
+
+def _write(out: Path, rows: list[dict[str, Any]]) -> None:
+    c = {
+        (row["dtype"], row["starts"], row["steps"], row["cores"]): row["steps_per_second"]
+        for row in rows
+        if row["name"] in ("C", "C, one start") and "problem" not in row
+    }
+    fastest = {dtype: max((rate for (d, *_), rate in c.items() if d == dtype), default=None) for dtype in DTYPES}
+    for row in rows:
+        if "problem" not in row:
+            same = c.get((row["dtype"], row["starts"], row["steps"], row["cores"]), fastest[row["dtype"]])
+            row["of_C"] = None if same is None else row["steps_per_second"] / same
+    io.write_json(out / "benchmark.json", {"versions": io.versions(), "rows": rows})
+
+
+def _table(rows: list[dict[str, Any]]) -> None:
+    def cells(row: dict[str, Any]) -> list[str]:
+        head = [row["name"], row["dtype"], f"{row['starts']:,}", str(row["steps"]), str(row["cores"])]
+        if "problem" in row:
+            return [*head, "-", "-", "-", "-", "-", row["problem"][:40]]
+        temporary = row["temporary_MiB"]
+        return [
+            *head,
+            f"{row['steps_per_second'] / 1e6:.4g}",
+            "-" if row["of_C"] is None else f"{row['of_C']:.3g}",
+            f"{row['compile_s']:.2f}",
+            f"{row['peak_MiB']:.0f}",
+            "-" if temporary is None else f"{temporary:.1f}",
+            f"{row['error_m']:.0e}",
+        ]
+
+    titles = ["contender", "dtype", "starts", "steps", "cores", "M steps/s", "of C", "compile s", "peak MiB"]
+    title = "Steps per second; every contender's answer is off by at most the last column after 1 s"
+    print_table(title, [*titles, "temp. MiB", "error m"], [cells(row) for row in rows], text_columns=2)
+
+
+def _picture(path: Path, rows: list[dict[str, Any]]) -> None:
+    figure = Figure(figsize=(13, 7), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for name in ("C", "cpjax"):
+        grown = [row for row in rows if row["name"] == name and row["steps"] == 1000 and "problem" not in row]
+        left.loglog([row["starts"] for row in grown], [row["steps_per_second"] for row in grown], "o-", label=name)
+    left.set(xlabel="starts", ylabel="steps per second", title="float32, 1,000 steps, all cores")
+    left.legend()
+    bars = [row for row in rows if row["starts"] in (64, 4096, 65536, 1, 2) and row["steps"] == STEPS]
+    bars = [row for row in bars if "problem" not in row]
+    labels = [f"{row['name']} ({row['starts']:,}, {row['dtype'][5:]})" for row in bars]
+    right.barh(labels, [row["steps_per_second"] for row in bars])
+    right.set(xscale="log", xlabel="steps per second", title="all contenders")
+    right.invert_yaxis()
+    save_figure(path, figure)
+
+
+if __name__ == "__main__":
+    run(main, __doc__ or "")
