@@ -42,6 +42,7 @@ MAIN: dict[str, tuple[int, ...]] = {
 OTHERS: dict[str, tuple[int, int, int]] = {
     "C, one start": (1, STEPS, 1),
     "cpjax, one start": (1, STEPS, 1),
+    "cpjax, one start, under jit": (1, STEPS, 1),
     "cpjax, values of 64": (64, STEPS, 1),
     "cpjax, gradient": (64, STEPS, 1),
     "cpjax, gradient, every step": (64, STEPS, 1),

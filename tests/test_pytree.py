@@ -28,7 +28,6 @@ from cpjax import (
     rollout,
 )
 from cpjax.pytree import number, pytree
-from cpjax.sim.rollout import _simulate
 
 PLANT = CartPole(
     pole_inertia=0.02, cart_friction=0.1, pivot_friction=0.01, motor=Motor(resistance=1.5, voltage_limit=math.inf)
@@ -259,19 +258,28 @@ def test_gradients_flow_through_every_constructor():
 
 
 def test_numbers_of_plant_controller_start_metrics_and_step_share_one_compilation():
-    fold = ProtocolMetrics()
-    measure(PLANT, HYBRID, START, metrics=fold, **RUN)
-    before = _simulate._cache_size()
     weak = jnp.multiply(2.0, 1.0)  # a JAX scalar without a type of its own
-    measure(dataclasses.replace(PLANT, cart_mass=2.0), HYBRID, START, **RUN)
-    measure(dataclasses.replace(PLANT, cart_mass=weak), HYBRID, State(weak, 0, np.float64(2.0), 0.0), **RUN)
-    measure(jax.tree.map(jnp.float32, PLANT), HYBRID, START, **RUN)
-    measure(dataclasses.replace(PLANT, motor=Motor(gear_ratio=np.array(3.0))), HYBRID, START, **RUN)
-    measure(PLANT, dataclasses.replace(HYBRID, regulator=StateFeedback([1, 2, 3, 4])), START, **RUN)
-    measure(PLANT, dataclasses.replace(HYBRID, gate=AngleGate(1.0)), START, **RUN)
-    measure(PLANT, HYBRID, START, metrics=ProtocolMetrics(hold=0.1), **RUN)
-    measure(PLANT, HYBRID, START, duration=0.4, dt=0.02, clock="sampled", control_period=0.02)
-    assert _simulate._cache_size() == before
+    changes = [
+        {"plant": dataclasses.replace(PLANT, cart_mass=2.0)},
+        {"plant": dataclasses.replace(PLANT, cart_mass=weak), "start": State(weak, 0, np.float64(2.0), 0.0)},
+        {"plant": jax.tree.map(jnp.float32, PLANT)},
+        {"plant": dataclasses.replace(PLANT, motor=Motor(gear_ratio=np.array(3.0)))},
+        {"controller": dataclasses.replace(HYBRID, regulator=StateFeedback([1, 2, 3, 4]))},
+        {"controller": dataclasses.replace(HYBRID, gate=AngleGate(1.0))},
+        {"metrics": ProtocolMetrics(hold=0.1)},
+        {"duration": 0.4, "dt": 0.02, "clock": "sampled", "control_period": 0.02},
+    ]
+    usual = {"plant": PLANT, "controller": HYBRID, "start": START, "metrics": ProtocolMetrics(), **RUN}
+    for array in (jnp.float32(1.0), weak):  # what a rollout converts arrays with is compiled too, once
+        measure(**usual | {"plant": dataclasses.replace(PLANT, cart_mass=array)})
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(lambda event, _, **__: compiled.append(event))
+    try:
+        for change in changes:
+            measure(**usual | change)
+    finally:
+        jax.monitoring.clear_event_listeners()
+    assert [event for event in compiled if "backend_compile" in event] == []
 
 
 def test_a_jitted_function_of_the_plant_is_traced_once_for_all_plants():

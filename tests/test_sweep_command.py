@@ -28,7 +28,7 @@ def test_it_writes_the_metrics_of_every_start_a_summary_and_a_picture(precision,
     np.testing.assert_allclose(travel, right.cart_travel, rtol=1e-12 if precision == "float64" else 1e-5)
     document = json.loads((tmp_path / "sweep.json").read_text())
     assert (document["seed"], document["precision"], document["file"]) == (5, precision, "metrics.npz")
-    assert io.decode(document["plant"]) == plant
+    assert document["plant"] == io.encode(plant)
     assert (tmp_path / "sweep.png").read_bytes().startswith(b"\x89PNG")
     text = capsys.readouterr().out
     assert "of 6 starts settle" in text

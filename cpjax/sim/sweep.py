@@ -113,12 +113,15 @@ def sweep(
     if any(is_traced(leaf) for leaf in work.leaves):
         columns, shared = _split(work.leaves, work.kind.batched)
         return jax.vmap(lambda column: results(*_one(column, shared, work.kind)))(columns)
-    parts = []
+    whole: Any = None
     for begin, part in zip(work.begins(), work.blocks(work.begins()), strict=True):
-        parts.append(part)
+        if whole is None:
+            whole = jax.tree.map(lambda array: _unwritten((work.total, *array.shape[1:]), array.dtype), part)
+        for array, rows in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
+            array[begin : begin + len(rows)] = rows
         if progress is not None:
             progress(min(begin + work.size, work.total), work.total)
-    return jax.tree.map(lambda *blocks: jnp.asarray(np.concatenate(blocks)), *parts)
+    return jax.tree.map(lambda array: jax.device_put(array, may_alias=True), whole)  # nobody else has it
 
 
 class _Kind(NamedTuple):
@@ -272,6 +275,14 @@ def _block(columns: list[jax.Array], shared: list[jax.Array], kind: _Kind) -> An
 @functools.cache
 def _compiled(platform: str) -> Any:
     return jax.jit(_block, static_argnames="kind", compiler_options=runtime.compiler_options(platform))
+
+
+def _unwritten(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """A NumPy array where JAX can use it as it is, without a copy: at a multiple of 64 bytes."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    memory = np.empty(size + 64, np.uint8)
+    begin = -memory.ctypes.data % 64
+    return memory[begin : begin + size].view(dtype).reshape(shape)
 
 
 def _place(array: np.ndarray, sharding: NamedSharding) -> jax.Array:

@@ -61,17 +61,22 @@ def _travel(found: Any) -> Any:
     return getattr(found, "metrics", found).cart_travel
 
 
-def cpjax_one(task: Task) -> Run:
-    """One start after another, by `cpjax.measure`."""
+def cpjax_one(task: Task, compiled: bool = False) -> Run:
+    """One start after another, by `cpjax.measure`, as it is or under the caller's `jax.jit`."""
     import jax
 
     import cpjax
 
     plant, controller = problem()
 
+    def measure(start: Any, steps: int) -> Any:
+        return cpjax.measure(plant, controller, start, **settings(steps))
+
+    one = jax.jit(measure, static_argnums=1) if compiled else measure
+
     def run(starts: Any, steps: int) -> Any:
         columns = [jax.tree.map(lambda column, i=i: column[i], starts) for i in range(len(starts.x))]
-        return [cpjax.measure(plant, controller, start, **settings(steps)).cart_travel for start in columns]
+        return [one(start, steps).cart_travel for start in columns]
 
     return run
 
@@ -317,10 +322,11 @@ CONTENDERS: dict[str, tuple[Callable[[Task], Run], str]] = {
     "C": (c_roofline, "by hand in C"),
     "C, one start": (partial(c_roofline, one=True), "by hand in C, compiled for one start"),
     "cpjax": (cpjax_sweep, "metrics"),
-    "cpjax, no options": (cpjax_sweep, "metrics, without cpjax.configure_cpu"),
+    "cpjax, no options": (cpjax_sweep, "metrics, on as many devices but without options of the compiler"),
     "cpjax, every 10th sample": (partial(cpjax_sweep, save_every=10), "trajectories"),
     "cpjax, every sample": (partial(cpjax_sweep, save_every=1), "trajectories"),
     "cpjax, one start": (cpjax_one, "cpjax.measure, one start after another"),
+    "cpjax, one start, under jit": (partial(cpjax_one, compiled=True), "cpjax.measure under jax.jit"),
     "cpjax, values of 64": (partial(cpjax_gradient, reverse=False), "a cost, under vmap"),
     "cpjax, gradient": (cpjax_gradient, "a cost and its gradient, reverse mode"),
     "cpjax, gradient, every step": (partial(cpjax_gradient, checkpoint="every_step"), "likewise, more remembered"),
@@ -347,6 +353,8 @@ def measure(name: str, task: Task, configured: bool) -> dict[str, Any]:
 
     if configured:
         cpjax.configure_cpu(devices=task.cores)
+    else:
+        jax.config.update("jax_num_cpu_devices", task.cores)  # type: ignore[no-untyped-call]
     starts = jax.tree.map(
         lambda column: np.asarray(column, task.dtype), cpjax.sample_starts("hanging", task.starts, seed=task.seed)
     )
