@@ -1,7 +1,8 @@
 """How JAX is to use a CPU: its cores as devices, and two options of XLA's compiler.
 
 By default XLA's CPU compiler makes several functions of one step of a simulation, computes what they share in each, and
-calls them one after the other: most of the time goes there. Two of its options end that:
+calls them one after the other: most of the time goes there. What `sim/compilation.py` does about it needs no options,
+but for values two of the compiler's do more:
 
     xla_cpu_use_multi_output_fusion          what several results need is computed once
     xla_cpu_small_while_loop_byte_threshold  a whole loop becomes one function
@@ -34,7 +35,9 @@ _FLAG = "--xla_backend_extra_options"
 
 
 def configure_cpu(devices: int | None = None) -> bool:
-    """Makes simulations on a CPU fast. Call it before JAX computes anything, once.
+    """Makes simulations of many starts on a CPU fast. Call it before JAX computes anything, once.
+
+    It is for values. Gradients are slower after it, those through a trajectory much slower (docs/performance.md).
 
     Args:
       devices: as how many devices the CPU is to appear, which `sweep` shares its starts out to; by default as many as

@@ -45,6 +45,7 @@ OTHERS: dict[str, tuple[int, int, int]] = {
     "cpjax, one start, under jit": (1, STEPS, 1),
     "cpjax, values of 64": (64, STEPS, 1),
     "cpjax, gradient": (64, STEPS, 1),
+    "cpjax, gradient with options": (64, STEPS, 1),
     "cpjax, gradient, every step": (64, STEPS, 1),
     "python-control": (2, STEPS, 1),
     "SciPy": (1, 1000, 1),
@@ -55,9 +56,8 @@ GROWTH = tuple(4**k for k in range(12))
 
 def measured(name: str, dtype: str, count: int, steps: int, cores: int, seed: int, repeats: int) -> dict[str, Any]:
     """One run of a contender; with "problem" where it has none of its libraries, or failed."""
-    configured = name.startswith("cpjax") and "no options" not in name and ("sample" in name or name == "cpjax")
     numbers = {"dtype": dtype, "starts": count, "steps": steps, "seed": seed, "cores": cores, "repeats": repeats}
-    command = [sys.executable, str(CONTENDERS), name] + ["--configured"] * configured
+    command = [sys.executable, str(CONTENDERS), name]
     command += [f"--{key}={value}" for key, value in numbers.items()]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:

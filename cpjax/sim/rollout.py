@@ -84,8 +84,8 @@ def rollout(
       spare_steps: of located switching, whose crossings take four steps each: the most that they may take together. A
         run that needs more is stopped and flagged. By default 64 and a sixteenth of the steps.
       checkpoint: what reverse mode remembers: the state at the ends of "segments" of about sqrt(n) steps, or at
-        "every_step", which takes more memory. Nothing else depends on it. (With switching per step and `save_every`
-        it remembers the saved states, whatever is asked for, and after `cpjax.configure_cpu` always "segments".)
+        "every_step", which takes more memory. Nothing else depends on it. (With switching per step, `rollout` remembers
+        the saved states, whatever is asked for, and `measure` after `cpjax.configure_cpu` always "segments".)
       metrics: a fold over all steps; by default `ProtocolMetrics()`.
 
     Raises:
@@ -143,7 +143,7 @@ def results(kept: Kept | None, last: Sample, result: Any) -> Any:
     """What users get of what `simulate` returned: a `Trajectory`, or only what the fold made of it."""
     if kept is None:
         return result
-    return Trajectory(**fields(kept, last), flag=last.flag & ~TURNED_FAR, metrics=result)  # type: ignore[arg-type]
+    return Trajectory(**fields(kept, last), flag=last.flag & ~TURNED_FAR, metrics=result)  # type: ignore[arg-type]  # of a dict
 
 
 def _without_designs(controller: Any) -> Any:
