@@ -14,9 +14,10 @@ from cpjax.plant import CartPole
 from cpjax.sim.metrics import Fold, Metrics
 from cpjax.sim.sweep import sweep
 from cpjax.state import State
+from cpjax.tune.outcome import document, request
 from cpjax.tune.parameters import FreeParameters
 from cpjax.tune.plan import Plan
-from cpjax.tune.tuner import document, request, tune
+from cpjax.tune.tuner import tune
 
 EVALUATION_SEED = 20_000
 """Of the starts that judge a tuning; no tuning sees them."""

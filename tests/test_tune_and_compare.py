@@ -13,7 +13,7 @@ from cpjax.presets import preset
 from cpjax.study.comparison import DESIGNS, best, compare, entries
 from cpjax.study.reproduction import Setting
 from cpjax.tune import tuner
-from cpjax.tune.tuner import Tuning
+from cpjax.tune.outcome import Tuning
 
 PLANT = paper.appendix_plant()
 SMALL = ("--candidates", "3", "--restarts", "2", "--batch", "2", "--steps", "2", "--duration", "1")

@@ -80,7 +80,8 @@ def add_command(commands: Any) -> None:
 
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
-    from cpjax.tune.tuner import document, tune  # optax takes a while; other commands should not wait for it
+    from cpjax.tune.outcome import document
+    from cpjax.tune.tuner import tune  # optax takes a while; other commands should not wait for it
 
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpjax.tune.tuner import Tuning
+from cpjax.tune.outcome import Tuning
 
 _BEST, _OTHERS = "#0072B2", "#999999"
 

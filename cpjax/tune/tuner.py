@@ -5,17 +5,13 @@ on a catch fails and the pendulum goes round again. Values know that, and they a
 start and what to keep, and gradients do the work in between.
 """
 
-import dataclasses
 import functools
-import io as buffers
-import json
 import math
 import operator
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,14 +20,14 @@ import optax
 
 from cpjax import io
 from cpjax.controllers import Hybrid, StateFeedback
-from cpjax.errors import InputError
-from cpjax.numeric.statistics import wilson_interval
 from cpjax.plant import CartPole, linearize
 from cpjax.sim.flags import Flag
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import measure
 from cpjax.starts import sample_starts
 from cpjax.state import State
+from cpjax.tune.checkpoint import Memory, restore, store
+from cpjax.tune.outcome import Tuning, request
 from cpjax.tune.parameters import FreeParameters, Vector
 from cpjax.tune.plan import Plan
 from cpjax.tune.plants import sample_plants
@@ -42,56 +38,6 @@ Report = Callable[[int, int, str], None]
 _FAILURE = 30.0  # what a start that fails counts, in horizons: success first, then time
 _SCREEN, _STEP, _VALIDATE, _SEMIFINAL, _FINAL, _CANDIDATES, _NOISE = range(7)  # what random numbers are for
 _BLOCK, _CONTROLLERS = 512, 64  # lanes that are simulated, and controllers that are designed, at once
-
-
-@dataclasses.dataclass(frozen=True)
-class Tuning:
-    """What `tune` found.
-
-    Attributes:
-      controller: the best one.
-      vector: its free parameters, unconstrained (d,).
-      labels: their names.
-      physical: and themselves, in SI units.
-      score: by which it was chosen: mean settling time [s], a failure counting three horizons; weighed as in the goal,
-        with its effort and jerkiness.
-      success_rate: on the starts of the last comparison.
-      settling_time: mean over the successes among them [s].
-      history: one record per validation.
-      value_steps: RK4 steps simulated for values alone.
-      gradient_steps: and with a gradient, iterations spent on crossings included.
-      seconds: of this process, compilation included.
-    """
-
-    controller: Hybrid
-    vector: Numbers
-    labels: tuple[str, ...]
-    physical: Numbers
-    score: float
-    success_rate: float
-    settling_time: float
-    history: list[dict[str, Any]]
-    value_steps: int
-    gradient_steps: int
-    seconds: float
-
-
-class _Memory(NamedTuple):
-    """All that a tuning needs to go on: the content of a checkpoint."""
-
-    step: int
-    vectors: Numbers
-    """(r, d)."""
-    optimiser: Any
-    best: Numbers
-    """(r, d)."""
-    scores: Numbers
-    """(r,), of `best`."""
-    stale: int
-    """Validations since the last improvement."""
-    history: list[dict[str, Any]]
-    value_steps: int
-    gradient_steps: int
 
 
 def tune(
@@ -116,11 +62,11 @@ def tune(
     began = time.perf_counter()
     tuner = _Tuner(plant, free, plan)
     say = progress if progress is not None else lambda done, total, text: None
-    memory = _restore(checkpoint, tuner)
+    memory = restore(checkpoint, tuner.identity, tuner.optimiser)
     if memory is None:
         say(0, plan.steps, f"screening {plan.candidates + 1} candidates")
         memory = tuner.begin()
-        _store(checkpoint, tuner, memory)
+        store(checkpoint, tuner.identity, memory)
     while memory.step < plan.steps and not (plan.patience and memory.stale >= plan.patience):
         last = memory.history[-1]
         say(
@@ -129,7 +75,7 @@ def tune(
             f"loss {last['loss']:.3f}, success {100 * max(last['success_rates']):.1f} %, best {min(memory.scores):.3f}",
         )
         memory = tuner.advance(memory)
-        _store(checkpoint, tuner, memory)
+        store(checkpoint, tuner.identity, memory)
     say(plan.steps, plan.steps, "last comparison")
     return tuner.finish(memory, began)
 
@@ -156,7 +102,7 @@ class _Tuner:
         """Metrics of controllers (n,) from starts (n,), each on the plant or on one of its own."""
         return jax.jit(jax.vmap(functools.partial(self._run, **settings)))
 
-    def begin(self) -> _Memory:
+    def begin(self) -> Memory:
         """Screens the candidates; the first restart is the given controller."""
         plan = self.plan
         given = np.asarray(self.free.start())[None]
@@ -172,12 +118,12 @@ class _Tuner:
                 break
             vectors, starts = vectors[order[: max(plan.restarts, len(vectors) // 4)]], 4 * starts
         chosen = vectors[order[: plan.restarts]]
-        start = _Memory(
+        start = Memory(
             0, chosen, self.optimiser.init(jnp.asarray(chosen)), chosen, np.full(len(chosen), np.inf), 0, [], steps, 0
         )
         return self._validate(start, np.nan)
 
-    def advance(self, memory: _Memory) -> _Memory:
+    def advance(self, memory: Memory) -> Memory:
         """Up to the next validation."""
         plan = self.plan
         vectors, state = jnp.asarray(memory.vectors), memory.optimiser
@@ -197,7 +143,7 @@ class _Tuner:
         memory = self._validate(memory, float(jnp.min(loss)))
         return self._select(memory) if memory.step < plan.steps else memory
 
-    def _select(self, memory: _Memory) -> _Memory:
+    def _select(self, memory: Memory) -> Memory:
         """The worse half goes on from the best of the better half, a little aside (Jaderberg and others, 2017)."""
         plan = self.plan
         order = np.argsort(memory.scores, kind="stable")
@@ -219,7 +165,7 @@ class _Tuner:
             vectors=vectors, best=best, scores=scores, optimiser=jax.tree.map(inherited, memory.optimiser)
         )
 
-    def finish(self, memory: _Memory, began: float) -> Tuning:
+    def finish(self, memory: Memory, began: float) -> Tuning:
         """Compares the best restarts on more starts and takes the best of them."""
         plan = self.plan
         semifinal, _, _ = self._score(memory.best, plan.final, _SEMIFINAL)
@@ -243,7 +189,7 @@ class _Tuner:
             seconds=time.perf_counter() - began,
         )
 
-    def _validate(self, memory: _Memory, loss: float) -> _Memory:
+    def _validate(self, memory: Memory, loss: float) -> Memory:
         plan = self.plan
         scores, rates, times = self._score(memory.vectors, plan.validation, _VALIDATE)
         better = scores < memory.scores
@@ -392,60 +338,3 @@ def fastest_pole_bound(A: jax.Array) -> jax.Array:
 def _seed(plan: Plan, purpose: int, step: int) -> int:
     """A seed that no person types in: of starts that no evaluation uses."""
     return 2**32 + int(np.random.SeedSequence([plan.seed, purpose, step]).generate_state(1)[0])
-
-
-def _store(path: Path | None, tuner: _Tuner, memory: _Memory) -> None:
-    if path is None:
-        return
-    leaves = jax.tree.leaves(memory.optimiser)
-    arrays = {f"optimiser_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-    arrays |= {name: getattr(memory, name) for name in ("vectors", "best", "scores")}
-    counts = {name: getattr(memory, name) for name in ("step", "stale", "value_steps", "gradient_steps")}
-    note = json.dumps({"identity": tuner.identity, "history": memory.history, **counts})
-    buffer = buffers.BytesIO()
-    arrays["note"] = np.frombuffer(note.encode(), dtype=np.uint8)
-    np.savez(buffer, allow_pickle=False, **arrays)
-    io.write_bytes(path, buffer.getvalue())
-
-
-def _restore(path: Path | None, tuner: _Tuner) -> _Memory | None:
-    if path is None or not path.exists():
-        return None
-    try:
-        with np.load(path) as content:
-            arrays = {name: content[name] for name in content.files}
-        note = json.loads(arrays.pop("note").tobytes())
-        blank = tuner.optimiser.init(jnp.asarray(arrays["vectors"]))
-        leaves = [jnp.asarray(arrays[f"optimiser_{i}"]) for i in range(len(jax.tree.leaves(blank)))]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as problem:
-        raise InputError("checkpoint", str(path), f"a file written by a tuning, or none ({problem})") from problem
-    if note.pop("identity") != tuner.identity:
-        allowed = "one of the same tuning (plan, plant, controller, versions); remove it, or choose another folder"
-        raise InputError("checkpoint", str(path), allowed)
-    optimiser = jax.tree.unflatten(jax.tree.structure(blank), leaves)
-    parts = {name: arrays[name] for name in ("vectors", "best", "scores")}
-    return _Memory(optimiser=optimiser, **parts, **note)
-
-
-def request(plant: CartPole, free: FreeParameters, plan: Plan) -> dict[str, Any]:
-    """What a tuning depends on, as plain values: two of the same request end in the same bits on one machine."""
-    return {
-        "versions": io.versions(),
-        "plan": plan.table(),
-        "plant": io.encode(plant),
-        "start_from": io.encode(free.controller),
-        "free": [slot._asdict() for slot in free.slots],
-    }
-
-
-def document(tuning: Tuning, plant: CartPole, free: FreeParameters, plan: Plan) -> dict[str, Any]:
-    """The result for programs; its controller is also a file of its own."""
-    fields = {f.name: getattr(tuning, f.name) for f in dataclasses.fields(tuning) if f.name != "controller"}
-    low, high = wilson_interval(round(tuning.success_rate * plan.final), plan.final)
-    return {
-        "what": "a tuning by gradients through swing-ups",
-        **request(plant, free, plan),
-        "controller": io.encode(tuning.controller),
-        "success_interval": [low, high],
-        **fields,
-    }

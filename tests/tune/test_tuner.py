@@ -8,11 +8,12 @@ import pytest
 
 from cpjax import paper
 from cpjax.errors import InputError
+from cpjax.tune.checkpoint import restore, store
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import AGGREGATES, Plan
 from cpjax.tune.plants import UNCERTAIN, sample_plants
 from cpjax.tune.starting import beginning
-from cpjax.tune.tuner import _restore, _store, _Tuner, tune
+from cpjax.tune.tuner import _Tuner, tune
 
 PLANT = paper.appendix_plant()
 SMALL = Plan(
@@ -31,8 +32,8 @@ def test_stopped_at_any_checkpoint_it_ends_in_the_same_bits(tuner, tmp_path):
     whole = stopped = tuner.begin()
     while whole.step < SMALL.steps:
         path = tmp_path / f"{whole.step}.npz"
-        _store(path, tuner, stopped)
-        stopped = tuner.advance(_restore(path, tuner))
+        store(path, tuner.identity, stopped)
+        stopped = tuner.advance(restore(path, tuner.identity, tuner.optimiser))
         whole = tuner.advance(whole)
     np.testing.assert_array_equal(whole.vectors, stopped.vectors)
     np.testing.assert_array_equal(whole.best, stopped.best)
@@ -45,7 +46,7 @@ def test_stopped_at_any_checkpoint_it_ends_in_the_same_bits(tuner, tmp_path):
 
 def test_a_checkpoint_of_another_tuning_is_refused(tuner, tmp_path):
     path = tmp_path / "checkpoint.npz"
-    _store(path, tuner, tuner.begin())
+    store(path, tuner.identity, tuner.begin())
     other = dataclasses.replace(SMALL, seed=2)
     with pytest.raises(InputError, match="same tuning"):
         tune(PLANT, tuner.free, other, checkpoint=path)
