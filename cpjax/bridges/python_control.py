@@ -16,12 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from cpjax.bridges.known import UNTRACEABLE, known_plant, refuse_unknown
 from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import Controller, Law, SingleLaw, as_controller
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor, linearize
-from cpjax.pytree import Number, cast, check, is_traced
+from cpjax.pytree import Number, cast, is_traced
 from cpjax.sim.integrators import rk4
 from cpjax.sim.settings import check_settings
 from cpjax.sim.stepper import applied_voltage, step_held
@@ -33,7 +34,6 @@ MEASURED = ("x", "theta")
 """What the paper measures, cart position and angle: the `outputs` of `state_space` when an observer is to follow."""
 
 _PERIOD = Number("s", "control period", above=0.0)
-_UNTRACEABLE = "JAX cannot trace through python-control"
 
 
 def state_space(
@@ -50,9 +50,9 @@ def state_space(
       InputError: as `cpjax.linearize`; a plant or equilibrium that JAX is tracing; an output that is no state, or is
         named twice.
     """
-    model = linearize(_known_plant(plant), equilibrium)
+    model = linearize(known_plant(plant), equilibrium)
     if is_traced(model.A):
-        raise InputError("equilibrium", equilibrium, f"known; {_UNTRACEABLE}")
+        raise InputError("equilibrium", equilibrium, f"known; {UNTRACEABLE}")
     A, B = (np.asarray(M, dtype=np.float64) for M in model)
     chosen = [outputs] if isinstance(outputs, str) else outputs
     known = isinstance(chosen, (list, tuple)) and len(chosen) > 0 and all(name in NAMES for name in chosen)
@@ -71,7 +71,7 @@ def plant_system(plant: CartPole) -> control.NonlinearIOSystem:
     Raises:
       InputError: `plant` is no CartPole with known numbers.
     """
-    plant = _known_plant(plant)
+    plant = known_plant(plant)
     saturate = _saturation(plant.motor)
 
     def update(t: float, state: Vector, inputs: Vector, params: Any) -> tuple[Any, ...]:
@@ -103,8 +103,8 @@ def closed_loop_system(
       InputError: bad arguments, named; `controller` without a control period, if it may remember its mode: laws
         do not, nor does a `cpjax.Hybrid` whose gate has hysteresis 0.
     """
-    plant, controller = _known_plant(plant), as_controller(controller)
-    _refuse_unknown("controller", controller)
+    plant, controller = known_plant(plant), as_controller(controller)
+    refuse_unknown("controller", controller)
     if control_period is not None:
         return _sampled_loop(plant, controller, control_period, dt)
     if dt is not None:
@@ -128,7 +128,7 @@ def gain_array(law: StateFeedback) -> Vector:
     """
     if not isinstance(law, StateFeedback):
         raise InputError("law", law, "a cpjax.StateFeedback")
-    _refuse_unknown("law", law)
+    refuse_unknown("law", law)
     reference = [float(getattr(law.reference, name)) for name in NAMES]
     if any(reference):
         raise InputError("law.reference", law.reference, "the origin; no gain represents another")
@@ -248,17 +248,3 @@ def _may_remember(controller: Controller) -> bool:
         return False
     hysteresis = getattr(controller.gate, "hysteresis", None) if isinstance(controller, Hybrid) else None
     return hysteresis is None or float(hysteresis) != 0.0
-
-
-def _known_plant(plant: Any) -> CartPole:
-    """`plant` with Python's floats for numbers."""
-    if not isinstance(plant, CartPole):
-        raise InputError("plant", plant, "a cpjax.CartPole")
-    _refuse_unknown("plant", plant)
-    return jax.tree.map(float, plant)
-
-
-def _refuse_unknown(name: str, tree: Any) -> None:
-    check(name, tree)
-    if any(is_traced(leaf) for leaf in jax.tree.leaves(tree)):
-        raise InputError(name, tree, f"of known numbers; {_UNTRACEABLE}")

@@ -8,6 +8,8 @@ import pytest
 from oracles import columns, rough_plant
 
 from cpjax import CartPole, Motor, State
+from cpjax.bridges.mujoco import LEAST_INERTIA, model_xml
+from cpjax.errors import InputError
 from cpjax.sim.integrators import rk4
 from cpjax.sim.stepper import step_held
 
@@ -16,48 +18,9 @@ mujoco = pytest.importorskip("mujoco")
 DT, PERIOD, DURATION = 1e-3, 20e-3, 3.0
 HELD = round(PERIOD / DT)
 
-# Positive theta leans towards negative x: a turn about -y. The wheels' force is an actuator on the cart's slide, what
-# the back-EMF and the bearings take is damping of that slide, and the rotor is its armature.
-MODEL = """
-<mujoco>
-  <option timestep="{dt}" integrator="RK4" gravity="0 0 -{gravity}"/>
-  <compiler angle="radian" boundmass="0" boundinertia="0"/>
-  <worldbody>
-    <body name="cart">
-      <joint name="slide" type="slide" axis="1 0 0" damping="{slide_damping}" armature="{armature}"/>
-      <inertial pos="0 0 0" mass="{cart_mass}" diaginertia="1 1 1"/>
-      <body name="pole">
-        <joint name="hinge" type="hinge" axis="0 -1 0" damping="{pivot_friction}"/>
-        <inertial pos="0 0 {pole_length}" mass="{pole_mass}" diaginertia="{inertia} {inertia} {inertia}"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor joint="slide" gear="{gear}" ctrllimited="true" ctrlrange="-{limit} {limit}"/>
-  </actuator>
-</mujoco>
-"""
-
 
 def mujoco_run(plant, start, voltages):
-    motor = plant.motor
-    turns = motor.gear_ratio / motor.wheel_radius  # rotor radians per metre
-    model = mujoco.MjModel.from_xml_string(
-        MODEL.format(
-            dt=DT,
-            gravity=plant.gravity,
-            cart_mass=plant.cart_mass,
-            pole_mass=plant.pole_mass,
-            pole_length=plant.pole_length,
-            inertia=plant.pole_inertia,
-            pivot_friction=plant.pivot_friction,
-            armature=motor.rotor_inertia * turns**2,
-            slide_damping=plant.cart_friction
-            + turns**2 * (motor.viscous_friction + motor.torque_constant * motor.back_emf_constant / motor.resistance),
-            gear=turns * motor.torque_constant / motor.resistance,
-            limit=motor.voltage_limit,
-        )
-    )
+    model = mujoco.MjModel.from_xml_string(model_xml(plant, DT))
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = (start.x, start.theta), (start.x_dot, start.theta_dot)
     states = [columns(start)]
@@ -80,10 +43,9 @@ def our_run(plant, start, voltages):
     return states
 
 
-# A point bob has no inertia of its own; MuJoCo asks for some. This much shifts the motion by less than 1e-7.
-NEARLY_NONE = 1e-9
+# The inertia that a point bob gets there, in both.
 POINT_BOB = CartPole(
-    pole_inertia=NEARLY_NONE,
+    pole_inertia=LEAST_INERTIA,
     cart_friction=0.15,
     pivot_friction=0.004,
     motor=Motor(rotor_inertia=0.05, viscous_friction=0.01, wheel_radius=0.7, gear_ratio=1.3, voltage_limit=12.0),
@@ -122,3 +84,28 @@ def test_the_tiny_inertia_stands_for_a_point_bob():
     with_inertia = columns(our_run(POINT_BOB, start, voltages))
     without = columns(our_run(replace(POINT_BOB, pole_inertia=0.0), start, voltages))
     assert np.max(np.abs(with_inertia - without)) <= 1e-7
+
+
+def test_a_supply_without_a_limit_is_one_in_mujoco_too():
+    plant = replace(ROD, motor=replace(ROD.motor, voltage_limit=math.inf))
+    free = mujoco_run(plant, State(0.0, 0.0, 1.0, 0.0), [40.0, 40.0])
+    clipped = mujoco_run(ROD, State(0.0, 0.0, 1.0, 0.0), [40.0, 40.0])
+    assert free[-1, 0] > 1.5 * clipped[-1, 0] > 0.0
+
+
+class OtherMotor(Motor):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("plant", "dt", "field"),
+    [
+        (replace(ROD, motor=OtherMotor()), DT, "plant.motor"),
+        (ROD.motor, DT, "plant"),
+        (ROD, 0.0, "dt"),
+        (ROD, math.nan, "dt"),
+    ],
+)
+def test_what_mujoco_cannot_be_told_is_refused(plant, dt, field):
+    with pytest.raises(InputError, match=field):
+        model_xml(plant, dt)
