@@ -2,14 +2,16 @@
 
     python experiments/benchmark.py
 
-Every contender runs in a process of its own (`benchmark/contenders.py`), on the same cores, one after another; the
-best of three runs counts. C needs a C compiler; numba
-and diffrax are optional (`pip install numba diffrax`): what is missing is named. Ratios are to the C code at the same
-precision, which does the same work as cpjax (law, kick, gate, flags and all metrics); the others do less, as
-`contenders.py` says of each. Measured and written after each contender: benchmark.json, benchmark.png.
+Every contender runs in a process of its own (`benchmark/contenders.py`), on the same cores, one after another; the best
+of three runs counts. C needs a C compiler. The other packages are optional, and those that are missing are named:
+`pip install --constraint constraints.txt '.[benchmark,peers]'`; for jaxonomy, which needs an older JAX, an environment
+of its own with `pip install jaxonomy tomli-w rich optax`, whose Python is named in JAXONOMY_PYTHON. Ratios are to the C
+code at the same precision, which does the same work as cpjax (law, kick, gate, flags and all metrics); the others do
+less, as `contenders.py` says of each. Measured and written after each contender: benchmark.json, benchmark.png.
 """
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -23,7 +25,7 @@ from cpjax.cli.tables import print_table
 from cpjax.show.figures import save_figure
 
 CONTENDERS = Path(__file__).with_name("benchmark") / "contenders.py"
-CORES, ROUNDS = 2, 1
+CORES = 2
 STEPS = 5000
 DTYPES = ("float32", "float64")
 
@@ -37,6 +39,7 @@ MAIN: dict[str, tuple[int, ...]] = {
     "plain JAX scan": (4096,),
     "diffrax, Heun": (4096,),
     "diffrax, Tsit5": (1024,),
+    "MJX": (256,),
 }
 # In float64 only: number of starts, steps, cores.
 OTHERS: dict[str, tuple[int, int, int]] = {
@@ -48,52 +51,55 @@ OTHERS: dict[str, tuple[int, int, int]] = {
     "cpjax, gradient with options": (64, STEPS, 1),
     "cpjax, gradient, every step": (64, STEPS, 1),
     "python-control": (2, STEPS, 1),
+    "MuJoCo rollout": (256, STEPS, CORES),
+    "jaxonomy, RK4": (1, STEPS, 1),
+    "jaxonomy, its own steps": (1, STEPS, 1),
     "SciPy": (1, 1000, 1),
 }
 GROWTH = tuple(4**k for k in range(12))
 """1 to 4,194,304 starts; 1,000 steps each."""
+LENGTHS = (50, 500, 50000)
+"""Steps of 4,096 starts."""
 
 
 def measured(name: str, dtype: str, count: int, steps: int, cores: int, seed: int, repeats: int) -> dict[str, Any]:
     """One run of a contender; with "problem" where it has none of its libraries, or failed."""
     numbers = {"dtype": dtype, "starts": count, "steps": steps, "seed": seed, "cores": cores, "repeats": repeats}
-    command = [sys.executable, str(CONTENDERS), name]
+    python, environment = sys.executable, dict(os.environ)
+    if name.startswith("jaxonomy") and "JAXONOMY_PYTHON" in environment:
+        python = environment["JAXONOMY_PYTHON"]
+        environment["PYTHONPATH"] = str(CONTENDERS.parents[2])  # for cpjax itself
+    command = [python, str(CONTENDERS), name]
     command += [f"--{key}={value}" for key, value in numbers.items()]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         return {"name": name, **numbers, "problem": (done.stderr.strip().splitlines() or ["no message"])[-1][:200]}
-    found: dict[str, Any] = json.loads(done.stdout)
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     """Prints the table, writes benchmark.json and benchmark.png."""
-    rounds, repeats = (1, 1) if quick else (ROUNDS, 3)
-    shrink = 64 if quick else 1
+    repeats, shrink = (1, 64) if quick else (3, 1)
+    steps = STEPS // min(shrink, 10)
     jobs = [
-        (name, dtype, max(1, count // shrink), STEPS // min(shrink, 10), CORES)
+        (name, dtype, max(1, count // shrink), steps, CORES)
         for name, counts in MAIN.items()
         for count in counts
         for dtype in DTYPES
     ]
+    jobs += [(name, "float64", count, each // min(shrink, 10), cores) for name, (count, each, cores) in OTHERS.items()]
+    both = ("C", "cpjax")
+    jobs += [(name, dtype, 65536 // shrink, steps, 1) for dtype in DTYPES for name in both]
     jobs += [
-        (name, "float64", count, steps // min(shrink, 10), cores) for name, (count, steps, cores) in OTHERS.items()
+        (name, "float32", 4096 // shrink, length, CORES) for length in LENGTHS[: 1 if quick else None] for name in both
     ]
-    jobs += [("cpjax", dtype, 65536 // shrink, STEPS // min(shrink, 10), 1) for dtype in DTYPES]
-    jobs += [
-        (name, "float32", count, 1000, CORES) for count in GROWTH[: 3 if quick else None] for name in ("C", "cpjax")
-    ]
-    best: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for number in range(rounds):
-        for place, job in enumerate(jobs):
-            print(f"round {number + 1} of {rounds}, {place + 1} of {len(jobs)}: {job}", file=sys.stderr, flush=True)
-            few = 1 if job[2] * job[3] > 1e9 else repeats
-            found = measured(*job, seed=seed, repeats=few)
-            before = best.get(job)
-            if before is None or found.get("steps_per_second", 0.0) > before.get("steps_per_second", 0.0):
-                best[job] = found
-            _write(out, list(best.values()))
-    rows = list(best.values())
+    jobs += [(name, "float32", count, 1000, CORES) for count in GROWTH[: 3 if quick else None] for name in both]
+    rows: list[dict[str, Any]] = []
+    for place, job in enumerate(jobs):
+        print(f"{place + 1} of {len(jobs)}: {job}", file=sys.stderr, flush=True)
+        rows.append(measured(*job, seed=seed, repeats=1 if job[2] * job[3] > 1e9 else repeats))
+        _write(out, rows)
     _table(rows)
     _picture(out / "benchmark.png", rows)
     print(f"written: {out / 'benchmark.json'}, {out / 'benchmark.png'}")
