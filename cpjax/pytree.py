@@ -8,6 +8,7 @@ options, the files' keys and the documentation, so that a parameter is described
 """
 
 import dataclasses
+import functools
 import math
 from typing import Any, TypeAlias, TypeVar, dataclass_transform
 
@@ -58,18 +59,22 @@ class Number:
                 value = float(value)
             except OverflowError as problem:
                 raise InputError(name, value, self.allowed()) from problem
-        numbers = _concrete_reals(name, value, self.allowed())
-        if numbers is not None and not self._holds(numbers):
+        if isinstance(value, float):  # every call of a rollout looks at dozens: without NumPy, for its speed
+            good = self._holds(value)
+        else:
+            numbers = _concrete_reals(name, value, self)
+            good = numbers is None or (numbers.size > 0 and bool(np.all(self._holds(numbers))))
+        if not good:
             raise InputError(name, value, self.allowed())
         return value
 
-    def _holds(self, v: np.ndarray) -> bool:
-        real = ~np.isnan(v) if self.infinite else np.isfinite(v)
-        inside = (v > self.above) | (self.above == -math.inf)
+    def _holds(self, v: Any) -> Any:
+        """Whether a float, or each number of an array, is in the range."""
+        real = v == v if self.infinite else abs(v) < math.inf
         # A closed end, such as pi, is still allowed after a rounding to float32.
-        inside &= (v >= self.at_least - 1e-6 * abs(self.at_least)) & (v <= self.at_most + 1e-6 * abs(self.at_most))
-        inside &= (v < self.below) | (self.below == math.inf)
-        return v.size > 0 and bool(np.all(real & inside))
+        low, high = self.at_least - 1e-6 * abs(self.at_least), self.at_most + 1e-6 * abs(self.at_most)
+        inside = ((v > self.above) | (self.above == -math.inf)) & ((v < self.below) | (self.below == math.inf))
+        return real & inside & (v >= low) & (v <= high)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +99,7 @@ class Matrix:
             value = value.reshape(self.shape)  # a plain row is welcome where a one-row matrix is meant
         if value.shape[-len(self.shape) :] != self.shape:
             raise InputError(name, f"array of shape {value.shape}", self.allowed())
-        numbers = _concrete_reals(name, value, self.allowed())
+        numbers = _concrete_reals(name, value, self)
         if numbers is None:
             return value
         finite = numbers.size > 0 and bool(np.all(np.isfinite(numbers)))
@@ -139,7 +144,12 @@ def part(help: str, *needs: str, default: Any = dataclasses.MISSING, default_fac
 
 
 def rules(cls: type) -> dict[str, Rule]:
-    """The declarations of a `pytree` class, by field name, in order."""
+    """The declarations of a `pytree` class, by field name, in order; not to be changed."""
+    return _rules(cls)
+
+
+@functools.cache
+def _rules(cls: Any) -> dict[str, Rule]:
     return {f.name: f.metadata[_RULE] for f in dataclasses.fields(cls) if _RULE in f.metadata}
 
 
@@ -198,11 +208,12 @@ def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
       InputError: a leaf that is no number, a number or matrix with another axis in front (which only `vmap` may take
         away), or a concrete one outside its declared range.
     """
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    for path, leaf in leaves:
-        if not (isinstance(leaf, (int, float)) or hasattr(leaf, "dtype")):
-            allowed = "a number; a class of your own is made a component by the decorator cpjax.pytree.pytree"
-            raise InputError(f"{name}{jax.tree_util.keystr(path)}", leaf, allowed)
+    leaves = jax.tree.leaves(tree)
+    strangers = [not (isinstance(leaf, (int, float)) or hasattr(leaf, "dtype")) for leaf in leaves]
+    if any(strangers):
+        path, leaf = jax.tree_util.tree_leaves_with_path(tree)[strangers.index(True)]
+        allowed = "a number; a class of your own is made a component by the decorator cpjax.pytree.pytree"
+        raise InputError(f"{name}{jax.tree_util.keystr(path)}", leaf, allowed)
     batched = _check_fields(name, tree, batch) if dataclasses.is_dataclass(tree) else []
     # A class that is a pytree in a way of its own has other leaves than fields; it is not looked into.
     return batched if len(batched) == len(leaves) else [False] * len(leaves)
@@ -219,12 +230,13 @@ def _check_fields(name: str, tree: Any, batch: int | None) -> list[bool]:
                 batched += check(f"{path}[{i}]", one, batch)
         elif rule is not None or not declared:  # a State declares nothing and holds scalars
             expected = rule.shape if isinstance(rule, Matrix) else ()
-            batched.append(np.shape(value) != expected)
-            if batched[-1] and (batch is None or np.shape(value) != (batch, *expected)):
+            shape = () if isinstance(value, float) else np.shape(value)
+            batched.append(shape != expected)
+            if batched[-1] and (batch is None or shape != (batch, *expected)):
                 more = (
                     "batches go through jax.vmap" if batch is None else f"or {(batch, *expected)}, one for each start"
                 )
-                raise InputError(path, f"array of shape {np.shape(value)}", f"of shape {expected}; {more}")
+                raise InputError(path, f"array of shape {shape}", f"of shape {expected}; {more}")
             if rule is not None:
                 rule.normalise(path, value)
         else:
@@ -242,10 +254,18 @@ def cast(tree: T, dtype: Any) -> T:
         real = isinstance(leaf, float) or jnp.issubdtype(getattr(leaf, "dtype", int), jnp.floating)
         if not real:
             return leaf
-        # What JAX does not have yet stays with NumPy: to start a computation with it takes a tenth of the time.
-        return (jnp if isinstance(leaf, jax.Array) else np).asarray(leaf, dtype=dtype)
+        return as_array(leaf, dtype)
 
     return jax.tree.map(convert, tree)
+
+
+def as_array(value: Any, dtype: Any) -> Array:
+    """As JAX's `asarray`, but what JAX does not have yet stays with NumPy, and what is as asked is not touched: a
+    rollout is called with dozens of numbers, and this takes a tenth of the time."""
+    if not isinstance(value, jax.Array):
+        return np.asarray(value, dtype=dtype)
+    ready = value.dtype == dtype and not value.weak_type
+    return value if ready else jnp.asarray(value, dtype=dtype)
 
 
 def _from_list(name: str, value: Any, allowed: str) -> np.ndarray[Any, Any]:
@@ -268,14 +288,12 @@ def _holds_tracers(value: Any) -> bool:
     return any(is_traced(leaf) for leaf in jax.tree.leaves(value))
 
 
-def _concrete_reals(name: str, value: Any, allowed: str) -> np.ndarray | None:
+def _concrete_reals(name: str, value: Any, rule: Number | Matrix) -> np.ndarray | None:
     """`value` as a float array, or None where it is traced and cannot be looked at."""
     if is_traced(value):
         return None
-    if isinstance(value, float):
-        return np.asarray(value)
     dtype = getattr(value, "dtype", None)
     if dtype is None or not jnp.issubdtype(dtype, jnp.floating):
         kind = f" of dtype {dtype}" if dtype is not None else ""
-        raise InputError(name, f"{value}{kind}" if kind else value, f"{allowed}, of a floating-point dtype")
+        raise InputError(name, f"{value}{kind}" if kind else value, f"{rule.allowed()}, of a floating-point dtype")
     return np.asarray(value, dtype=np.float64)

@@ -14,7 +14,7 @@ import numpy as np
 
 from cpjax.errors import InputError
 from cpjax.numeric.trigonometry import wrap_angle
-from cpjax.pytree import Number, Scalar, is_traced, pytree
+from cpjax.pytree import Number, Scalar, as_array, is_traced, pytree
 
 NAMES = ("x", "x_dot", "theta", "theta_dot")
 UNITS = ("m", "m/s", "rad", "rad/s")
@@ -86,7 +86,7 @@ _LARGEST = {"x": RUNAWAY_LIMIT, "x_dot": RUNAWAY_LIMIT, "theta": ANGLE_LIMIT, "t
 
 
 def checked_start(start: Any, field: str, *, batched: bool) -> tuple[State, Any]:
-    """`start` as a State of JAX arrays of one dtype, and that dtype.
+    """`start` as a State of arrays of one dtype, and that dtype.
 
     Python numbers take the dtype of the arrays beside them, or JAX's default float if there are none.
 
@@ -115,7 +115,7 @@ def checked_start(start: Any, field: str, *, batched: bool) -> tuple[State, Any]
         mixture = ", ".join(f"{name}: {dtype}" for name, dtype in dtypes.items())
         raise InputError(field, f"State with dtypes {mixture}", "of one dtype, float32 or float64, throughout")
     dtype = next(iter(dtypes.values()), jnp.result_type(float))
-    values = [jnp.asarray(getattr(start, name), dtype=dtype) for name in NAMES]
+    values = [as_array(getattr(start, name), dtype) for name in NAMES]
     if batched:
         shapes = f"State of shapes {[v.shape for v in values]}"
         if max(v.ndim for v in values) > 1 or min(v.size for v in values) == 0:

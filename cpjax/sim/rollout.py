@@ -4,12 +4,12 @@ Everything here is for one start; batches are `jax.vmap` of it (`cpjax.sweep` do
 scan: that of `per_step.py`, or that of `located.py`.
 """
 
-import dataclasses
+import copy
 import functools
 from typing import Any
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.protocol import Controller, Law, SmoothController, as_controller
@@ -151,14 +151,18 @@ def _without_designs(controller: Any) -> Any:
 
     def bare(law: Any) -> Any:
         designed = isinstance(law, StateFeedback) and law.design is not None
-        return dataclasses.replace(law, design=None) if designed else law
+        if not designed:
+            return law
+        law = copy.copy(law)  # which has been checked
+        object.__setattr__(law, "design", None)
+        return law
 
     return jax.tree.map(bare, controller, is_leaf=lambda part: isinstance(part, StateFeedback))
 
 
 def cast_arguments(
     plant: Any, controller: Any, fold: Fold | None, dt: float, dtype: Any, settings: Settings, batch: int | None = None
-) -> tuple[tuple[CartPole, Controller, Fold, jax.Array], list[bool]]:
+) -> tuple[tuple[CartPole, Controller, Fold, Any], list[bool]]:
     """What `simulate` takes after the start, and for each of its leaves whether it has an axis of length `batch`.
 
     Raises:
@@ -174,5 +178,5 @@ def cast_arguments(
         raise InputError("controller", controller, "one with margin and successor, for located switching")
     parts = (("plant", plant), ("controller", controller), ("metrics", fold))
     batched = [leaf for name, part in parts for leaf in check(name, part, batch)]
-    arguments = cast(plant, dtype), cast(controller, dtype), cast(fold, dtype), jnp.asarray(dt, dtype=dtype)
+    arguments = cast(plant, dtype), cast(controller, dtype), cast(fold, dtype), np.asarray(dt, dtype=dtype)
     return arguments, [*batched, False]
