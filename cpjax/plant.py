@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cpjax.errors import InputError
+from cpjax.numeric.extremes import larger, smaller
 from cpjax.numeric.trigonometry import sin_cos
 from cpjax.pytree import Number, Scalar, check, is_traced, number, part, pytree
 from cpjax.state import HANGING, UPRIGHT, State
@@ -44,7 +45,7 @@ class Motor:
 
     def saturate(self, voltage: Scalar) -> jax.Array:
         """The demanded voltage [V] clipped to the supply. Derivative 1 inside, 0 outside, 1/2 exactly on the limit."""
-        return jnp.clip(voltage, -self.voltage_limit, self.voltage_limit)
+        return larger(-self.voltage_limit, smaller(self.voltage_limit, voltage))
 
     def current(self, voltage: Scalar, x_dot: Scalar) -> Scalar:
         """Current in the winding [A] at an applied voltage [V] and cart velocity [m/s]."""

@@ -49,6 +49,12 @@ class State:
         return cls(*(vector[..., i] for i in range(4)))
 
 
+def within_bounds(state: State) -> jax.Array:
+    """Whether no component is beyond `RUNAWAY_LIMIT`, or `ANGLE_LIMIT` for theta, or NaN."""
+    small = (jnp.abs(state.x) <= RUNAWAY_LIMIT) & (jnp.abs(state.theta) <= ANGLE_LIMIT)
+    return small & (jnp.abs(state.x_dot) <= RUNAWAY_LIMIT) & (jnp.abs(state.theta_dot) <= RUNAWAY_LIMIT)
+
+
 def deviation(state: State, reference: State) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """`state` less `reference`, in the order of `NAMES`, with the angle's difference taken modulo a turn."""
     return (

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from cpjax.controllers.gates import Gate
 from cpjax.controllers.protocol import REGULATE, SWING_UP, Law
@@ -27,7 +28,7 @@ class Hybrid:
 
     def next_mode(self, state: State, mode: jax.Array) -> jax.Array:
         """REGULATE where the gate's margin in the present mode is at least 0. Has no derivative: it is a switch."""
-        return jnp.where(self.gate.margin(state, mode) >= 0.0, REGULATE, SWING_UP).astype(jnp.int32)
+        return jnp.where(self.gate.margin(state, mode) >= 0.0, np.int32(REGULATE), np.int32(SWING_UP))
 
     def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
         """Both laws are evaluated and one is taken; the other, if finite, contributes neither value nor derivative."""

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from cpjax.controllers.protocol import SmoothController
 from cpjax.plant import CartPole
@@ -22,7 +23,7 @@ from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
 from cpjax.sim.stepper import ClosedLoop
 from cpjax.sim.switching import LANDED, RUN, Motion, iterate, pick, start_motion
-from cpjax.state import ANGLE_LIMIT, RUNAWAY_LIMIT, State
+from cpjax.state import RUNAWAY_LIMIT, State, within_bounds
 
 
 class _Loop(NamedTuple):
@@ -30,6 +31,10 @@ class _Loop(NamedTuple):
 
     motion: Motion
     flag: jax.Array
+    voltage: jax.Array
+    """At the sample before [V]."""
+    mode: jax.Array
+    """At the sample before."""
 
 
 def simulate(
@@ -39,7 +44,7 @@ def simulate(
     all of them."""
     system = ClosedLoop(plant, controller)
     motion = start_motion(system, (start.x, start.theta), (start.x_dot, start.theta_dot), system.start_mode(start), dt)
-    loop = _Loop(motion, unknown((start, plant, controller)))
+    loop = _Loop(motion, unknown((start, plant, controller)), motion.seen.output, motion.mode.law)
     first = _sample(loop, motion, dt)
 
     run = one_function(functools.partial(_run, settings=settings), stacks=True)
@@ -70,8 +75,10 @@ def _run(
         before, memory = carry
         loop, reached = _advance(system, integrator, before, dt, steps, iterations - index)
         sample = _sample(loop, before.motion, dt)
-        updated = part_of_step(type(fold).update)(fold, memory, sample)
-        memory = jax.tree.map(lambda new, old: jnp.where(reached, new, old), updated, memory)
+        updated = part_of_step(type(fold).update)(fold, memory, sample), sample.voltage, sample.mode
+        kept = memory, loop.voltage, loop.mode
+        memory, voltage, mode = jax.tree.map(lambda new, old: jnp.where(reached, new, old), updated, kept)
+        loop = loop._replace(voltage=voltage, mode=mode)
         return (loop, memory), (None if settings.save_every is None else (pack(sample), loop.motion.passed))
 
     return scan(body, carry, jnp.arange(iterations, dtype=jnp.int32), settings.checkpoint)
@@ -86,8 +93,10 @@ def _sample(loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
         elapsed=motion.elapsed,
         state=State(motion.q[0], motion.v[0], motion.q[1], motion.v[1]),
         voltage=motion.seen.output,
-        voltage_before=jnp.where(landed, before.seen.output, motion.seen.output),
+        voltage_since=loop.voltage,
+        voltage_until=jnp.where(landed, before.seen.output, motion.seen.output),
         mode=motion.mode.law,
+        mode_before=loop.mode,
         cart_acceleration=jnp.asarray(motion.seen.acceleration[0]),
         flag=loop.flag,
         crossing=jnp.where(landed, before.guard + 1, 0),
@@ -107,19 +116,18 @@ def _advance(
     motion = loop.motion
     stopped, ended = (loop.flag & STOPPED) != 0, motion.passed >= steps
     acceleration = motion.seen.acceleration
-    ahead = jnp.maximum(jnp.abs(motion.v[0] + dt * acceleration[0]), jnp.abs(motion.v[1] + dt * acceleration[1]))
-    going = ~stopped & ~ended & (ahead <= RUNAWAY_LIMIT)
+    ahead = motion.v[0] + dt * acceleration[0], motion.v[1] + dt * acceleration[1]
+    going = ~stopped & ~ended & (jnp.abs(ahead[0]) <= RUNAWAY_LIMIT) & (jnp.abs(ahead[1]) <= RUNAWAY_LIMIT)
     safe = jax.tree.map(lambda x: jnp.where(going, x, 0), motion)
     after, reached = iterate(system, integrator, safe, dt)
-    fastest = jnp.maximum(jnp.abs(after.v[0]), jnp.abs(after.v[1]))
-    within = (jnp.maximum(jnp.abs(after.q[0]), fastest) <= RUNAWAY_LIMIT) & (jnp.abs(after.q[1]) <= ANGLE_LIMIT)
+    within = within_bounds(State(after.q[0], after.v[0], after.q[1], after.v[1]))
     in_time = left > steps - after.passed
     good = going & within & in_time
-    finite = jnp.isfinite(ahead + after.q[0] + after.v[0] + after.q[1] + after.v[1])
-    lost = jnp.where(finite, int(Flag.RUNAWAY), int(Flag.NON_FINITE))
-    reason = jnp.where(going & within & finite, int(Flag.OVERFLOW), lost)
-    chatter = jnp.where(good & (after.crossings >= CHATTER_LENGTH), int(Flag.CHATTERING), 0)
-    flag = loop.flag | jnp.where(stopped | ended | good, 0, reason) | chatter
+    finite = jnp.isfinite(ahead[0] + ahead[1] + after.q[0] + after.v[0] + after.q[1] + after.v[1])
+    lost = jnp.where(finite, np.int32(Flag.RUNAWAY), np.int32(Flag.NON_FINITE))
+    reason = jnp.where(going & within & finite, np.int32(Flag.OVERFLOW), lost)
+    chatter = jnp.where(good & (after.crossings >= CHATTER_LENGTH), np.int32(Flag.CHATTERING), np.int32(0))
+    flag = loop.flag | jnp.where(stopped | ended | good, np.int32(0), reason) | chatter
     # A run that is held passes one grid point an iteration.
     held = motion._replace(
         passed=motion.passed + (~ended).astype(motion.passed.dtype),
@@ -128,4 +136,4 @@ def _advance(
         stage=jnp.full_like(motion.stage, RUN),
     )
     motion = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, held)
-    return _Loop(motion, flag), (good & reached) | (~good & ~ended)
+    return loop._replace(motion=motion, flag=flag), (good & reached) | (~good & ~ended)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cpjax.numeric.extremes import larger, smaller
 from cpjax.numeric.trigonometry import sin_cos, wrap_angle
 from cpjax.pytree import Scalar, number, pytree
 from cpjax.sim.flags import STOPPED
@@ -28,10 +29,15 @@ class Sample(NamedTuple):
     state: State
     voltage: jax.Array
     """Applied from now on, clipped [V]."""
-    voltage_before: jax.Array
-    """Applied until now [V]: what was held, or the law of the mode until now at this state."""
+    voltage_since: jax.Array
+    """Applied right after the sample before [V]; at the first sample `voltage`."""
+    voltage_until: jax.Array | None
+    """Applied right before this sample [V]: the law of the mode until now at this state. None on the sampled clock: a
+    held voltage is still what it was."""
     mode: jax.Array
     """From now on."""
+    mode_before: jax.Array
+    """Until now, since the sample before."""
     cart_acceleration: jax.Array
     """x'' from now on [m/s^2]."""
     flag: jax.Array
@@ -40,6 +46,11 @@ class Sample(NamedTuple):
     """What was located here, int32: 0 nothing, 1 and 2 the upper and the lower end of the supply, 3 the gate."""
     crossing_speed: jax.Array
     """How fast that guard fell [1/s]: of the voltage relative to the limit, or of the gate's margin. 0 elsewhere."""
+
+    @property
+    def voltage_before(self) -> jax.Array:
+        """Applied right before this sample [V], on either clock."""
+        return self.voltage_since if self.voltage_until is None else self.voltage_until
 
 
 GATE_CROSSING = 3
@@ -128,8 +139,6 @@ class _Memory(NamedTuple):
     peak_voltage: jax.Array
     peak_cart_acceleration: jax.Array
     switches: jax.Array
-    voltage: jax.Array
-    mode: jax.Array
 
 
 @pytree
@@ -152,28 +161,27 @@ class ProtocolMetrics:
             peak_voltage=nothing,
             peak_cart_acceleration=nothing,
             switches=jnp.zeros_like(sample.mode),
-            voltage=sample.voltage,
-            mode=sample.mode,
         )
 
     def update(self, memory: _Memory, sample: Sample) -> _Memory:
         travel = jnp.abs(sample.state.x)
         away = jnp.abs(sample.state.x - self.reference_x)
         inside = (jnp.abs(wrap_angle(sample.state.theta)) <= self.angle_band) & (away <= self.position_band)
-        drift = jnp.abs(sample.voltage_before - memory.voltage)
-        jump = jnp.abs(sample.voltage - sample.voltage_before)
-        first, last = memory.voltage, sample.voltage_before
+        first, last = sample.voltage_since, sample.voltage_until
+        variation = jnp.abs(sample.voltage - sample.voltage_before)
+        # The factors stand so that 0 s of a huge voltage is 0 and not 0 times infinity.
+        effort = sample.elapsed * first * first
+        if last is not None:
+            variation = variation + jnp.abs(last - first)
+            effort = 0.5 * (effort + sample.elapsed * last * last)
         return _Memory(
-            entered=jnp.where(inside, jnp.minimum(memory.entered, sample.time), math.inf),
-            cart_travel=jnp.maximum(memory.cart_travel, travel),
-            # The factors stand so that 0 s of a huge voltage is 0 and not 0 times infinity.
-            effort=memory.effort + 0.5 * (sample.elapsed * first * first + sample.elapsed * last * last),
-            voltage_variation=memory.voltage_variation + drift + jump,
-            peak_voltage=jnp.maximum(memory.peak_voltage, jnp.abs(sample.voltage)),
-            peak_cart_acceleration=jnp.maximum(memory.peak_cart_acceleration, jnp.abs(sample.cart_acceleration)),
-            switches=memory.switches + (sample.mode != memory.mode).astype(memory.switches.dtype),
-            voltage=sample.voltage,
-            mode=sample.mode,
+            entered=jnp.where(inside, smaller(sample.time, memory.entered), math.inf),
+            cart_travel=larger(memory.cart_travel, travel),
+            effort=memory.effort + effort,
+            voltage_variation=memory.voltage_variation + variation,
+            peak_voltage=larger(memory.peak_voltage, jnp.abs(sample.voltage)),
+            peak_cart_acceleration=larger(memory.peak_cart_acceleration, jnp.abs(sample.cart_acceleration)),
+            switches=memory.switches + (sample.mode != sample.mode_before).astype(memory.switches.dtype),
         )
 
     def finish(self, memory: _Memory, last: Sample) -> Metrics:

@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from cpjax import runtime
 from cpjax.controllers.protocol import Controller
-from cpjax.numeric.trigonometry import LARGEST_TURN, sin_cos
+from cpjax.numeric.trigonometry import sin_cos
 from cpjax.plant import CartPole
 from cpjax.sim.compilation import one_function, part_of_step
 from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, TURNED_FAR, Flag, unknown
@@ -21,7 +22,7 @@ from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
 from cpjax.sim.stepper import Pair, applied_voltage, rates, step_continuous, step_held, step_held_by_turns
-from cpjax.state import ANGLE_LIMIT, RUNAWAY_LIMIT, State
+from cpjax.state import RUNAWAY_LIMIT, State, within_bounds
 
 
 class _Instant(NamedTuple):
@@ -99,16 +100,13 @@ def _observe(
     mode = controller.next_mode(state, loop.mode)
     voltage = applied_voltage(plant, controller, state, mode)
     changes = jnp.where(mode != loop.mode, loop.changes + 1, 0)
-    if settings.clock == "continuous":
-        voltage_before = applied_voltage(plant, controller, state, loop.mode)
-    else:
-        voltage_before = loop.voltage
-        if settings.steps_per_control > 1:
-            instant = index % settings.steps_per_control == 0
-            mode = jnp.where(instant, mode, loop.mode)
-            voltage = jnp.where(instant, voltage, loop.voltage)
-            changes = jnp.where(instant, changes, loop.changes)
-    flag = loop.flag | jnp.where(changes >= CHATTER_LENGTH, int(Flag.CHATTERING), 0)
+    until = applied_voltage(plant, controller, state, loop.mode) if settings.clock == "continuous" else None
+    if settings.steps_per_control > 1:
+        instant = index % settings.steps_per_control == 0
+        mode = jnp.where(instant, mode, loop.mode)
+        voltage = jnp.where(instant, voltage, loop.voltage)
+        changes = jnp.where(instant, changes, loop.changes)
+    flag = loop.flag | jnp.where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
     direction = sin_cos(state.theta)
     accelerations = part_of_step(rates)(plant, direction, (state.x_dot, state.theta_dot), voltage)
     sample = Sample(
@@ -116,8 +114,10 @@ def _observe(
         elapsed=jnp.where((index > 0) & ((flag & STOPPED) == 0), dt, 0.0),
         state=state,
         voltage=voltage,
-        voltage_before=voltage_before,
+        voltage_since=loop.voltage,
+        voltage_until=until,
         mode=mode,
+        mode_before=loop.mode,
         cart_acceleration=jnp.asarray(accelerations[0]),
         flag=flag,
         crossing=jnp.zeros_like(mode),
@@ -139,20 +139,18 @@ def _advance(
     state, method, far = loop.state, INTEGRATORS[settings.integrator], jnp.zeros_like(loop.flag)
     first, direction = instant
     stopped = (loop.flag & STOPPED) != 0
-    ahead = jnp.maximum(jnp.abs(state.x_dot + dt * first[0]), jnp.abs(state.theta_dot + dt * first[1]))
-    going = ~stopped & (ahead <= RUNAWAY_LIMIT)
+    ahead = state.x_dot + dt * first[0], state.theta_dot + dt * first[1]
+    going = ~stopped & (jnp.abs(ahead[0]) <= RUNAWAY_LIMIT) & (jnp.abs(ahead[1]) <= RUNAWAY_LIMIT)
     safe, safe_first = jax.tree.map(lambda value: jnp.where(going, value, 0.0), (state, first))
     if settings.turns:  # values only, so nothing has to be safe
-        after, turn = step_held_by_turns(plant, method, state, direction, loop.voltage, dt, first)
-        far = jnp.where(going & (turn > LARGEST_TURN), TURNED_FAR, 0)
+        after, near = step_held_by_turns(plant, method, state, direction, loop.voltage, dt, first)
+        far = jnp.where(going & ~near, np.int32(TURNED_FAR), np.int32(0))
     elif settings.clock == "continuous":
         after = step_continuous(plant, controller, method, safe, loop.mode, dt, safe_first)
     else:
         after = step_held(plant, method, safe, jnp.where(going, loop.voltage, 0.0), dt, safe_first)
-    fastest = jnp.maximum(jnp.abs(after.x_dot), jnp.abs(after.theta_dot))
-    within = (jnp.maximum(jnp.abs(after.x), fastest) <= RUNAWAY_LIMIT) & (jnp.abs(after.theta) <= ANGLE_LIMIT)
-    good = going & within
-    finite = jnp.isfinite(ahead + after.x + after.x_dot + after.theta + after.theta_dot)
-    reason = jnp.where(finite, int(Flag.RUNAWAY), int(Flag.NON_FINITE))
+    good = going & within_bounds(after)
+    finite = jnp.isfinite(ahead[0] + ahead[1] + after.x + after.x_dot + after.theta + after.theta_dot)
+    reason = jnp.where(finite, np.int32(Flag.RUNAWAY), np.int32(Flag.NON_FINITE))
     state = jax.tree.map(lambda old, new: jnp.where(good, new, old), state, after)
-    return loop._replace(state=state, flag=loop.flag | jnp.where(stopped | good, 0, reason) | far)
+    return loop._replace(state=state, flag=loop.flag | jnp.where(stopped | good, np.int32(0), reason) | far)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from cpjax.controllers.protocol import Controller, SmoothController
-from cpjax.numeric.trigonometry import sin_cos, turned
+from cpjax.numeric.trigonometry import LARGEST_TURN, sin_cos, turned
 from cpjax.plant import CartPole
 from cpjax.pytree import Scalar
 from cpjax.sim.compilation import part_of_step
@@ -57,24 +57,22 @@ def step_held_by_turns(
     dt: Scalar,
     first: Pair | None = None,
 ) -> tuple[State, jax.Array]:
-    """As `step_held`, and the largest turn away from `state` [rad] of the angles at which the plant was evaluated.
-
-    Their sines and cosines are those at `state`, turned. That is right to rounding if no turn was larger than
-    `cpjax.numeric.trigonometry.LARGEST_TURN`; the caller is to see to it.
+    """As `step_held`, but the sines and cosines of the later stages are those at `state`, turned; and whether that is
+    right to rounding: no turn was larger than `cpjax.numeric.trigonometry.LARGEST_TURN`.
 
     Args:
       direction: sine and cosine of the angle at `state`.
     """
-    largest = jnp.zeros_like(state.theta)
+    near = jnp.asarray(True)
 
     def acceleration(q: Pair, v: Pair) -> Pair:
-        nonlocal largest
+        nonlocal near
         turn = jnp.asarray(q[1] - state.theta)
-        largest = jnp.maximum(largest, jnp.abs(turn))
+        near &= jnp.abs(turn) <= LARGEST_TURN
         turned_to = turned(jnp.asarray(direction[0]), jnp.asarray(direction[1]), turn)
         return part_of_step(rates)(plant, turned_to, v, voltage)
 
-    return _integrate(integrator, acceleration, state, dt, first), largest
+    return _integrate(integrator, acceleration, state, dt, first), near
 
 
 def step_continuous(

@@ -82,16 +82,17 @@ class Jerkiness:
 
     rounding: Scalar = number("V", "changes far smaller than this count little", default=0.1, above=0.0)
 
-    def init(self, sample: Sample) -> tuple[jax.Array, jax.Array]:
-        return jnp.zeros_like(sample.time), sample.voltage
+    def init(self, sample: Sample) -> jax.Array:
+        return jnp.zeros_like(sample.time)
 
-    def update(self, memory: tuple[jax.Array, jax.Array], sample: Sample) -> tuple[jax.Array, jax.Array]:
-        total, before = memory
-        moved = self._size(sample.voltage_before - before) + self._size(sample.voltage - sample.voltage_before)
-        return total + moved, sample.voltage
+    def update(self, memory: jax.Array, sample: Sample) -> jax.Array:
+        moved = self._size(sample.voltage - sample.voltage_before)
+        if sample.voltage_until is not None:
+            moved = moved + self._size(sample.voltage_until - sample.voltage_since)
+        return memory + moved
 
-    def finish(self, memory: tuple[jax.Array, jax.Array], last: Sample) -> jax.Array:
-        return memory[0]
+    def finish(self, memory: jax.Array, last: Sample) -> jax.Array:
+        return memory
 
     def _size(self, change: jax.Array) -> jax.Array:
         return jnp.sqrt(change * change + self.rounding * self.rounding) - self.rounding
