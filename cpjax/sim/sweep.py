@@ -9,7 +9,7 @@ What is computed for a start does not depend on any of this.
 import functools
 import math
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -174,8 +174,15 @@ class Work(NamedTuple):
         members = np.minimum(np.arange(begin, begin + self.size), self.total - 1)
         columns, shared = _split(self.leaves, kind.batched)
         placed = [_place(np.asarray(column)[members], NamedSharding(kind.mesh, _SHARED_OUT)) for column in columns]
-        replicated = [_place(np.asarray(leaf), NamedSharding(kind.mesh, _EVERYWHERE)) for leaf in shared]
-        return _compiled(kind.mesh.devices.flat[0].platform)(placed, replicated, kind)
+        # As few arrays as can be: to hand over dozens takes longer than a small sweep.
+        numbers = [np.asarray(leaf) for leaf in shared]
+        forms = tuple((leaf.shape, leaf.dtype.str) for leaf in numbers)
+        packed = {
+            dtype: np.concatenate([leaf.ravel() for leaf in numbers if leaf.dtype.str == dtype])
+            for dtype in dict.fromkeys(dtype for _, dtype in forms)
+        }
+        replicated = {dtype: _place(one, NamedSharding(kind.mesh, _EVERYWHERE)) for dtype, one in packed.items()}
+        return _compiled(kind.mesh.devices.flat[0].platform)(placed, replicated, kind, forms)
 
     def _collect(self, begin: int, results: Any) -> Any:
         result, flag = jax.tree.map(_gather, results)
@@ -257,8 +264,14 @@ def _one(column: list[Any], shared: list[Any], kind: _Kind) -> tuple[Kept | None
     return simulate(start, plant, controller, fold, dt, kind.settings)
 
 
-def _block(columns: list[jax.Array], shared: list[jax.Array], kind: _Kind) -> Any:
-    def share(columns: list[jax.Array], shared: list[jax.Array]) -> Any:
+_Forms: TypeAlias = tuple[tuple[tuple[int, ...], str], ...]
+"""Shape and dtype of each leaf that all starts share."""
+
+
+def _block(columns: list[jax.Array], packed: dict[str, jax.Array], kind: _Kind, forms: _Forms) -> Any:
+    def share(columns: list[jax.Array], packed: dict[str, jax.Array]) -> Any:
+        shared = _unpacked(packed, forms)
+
         def chunk(column: list[jax.Array]) -> Any:
             return jax.vmap(lambda lane: _one(lane, shared, kind), out_axes=(1, 0, 0))(column)
 
@@ -269,12 +282,20 @@ def _block(columns: list[jax.Array], shared: list[jax.Array], kind: _Kind) -> An
         return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), trees)
 
     specs = {"in_specs": (_SHARED_OUT, _EVERYWHERE), "out_specs": _SHARED_OUT}
-    return jax.shard_map(share, mesh=kind.mesh, check_vma=False, **specs)(columns, shared)
+    return jax.shard_map(share, mesh=kind.mesh, check_vma=False, **specs)(columns, packed)
+
+
+def _unpacked(packed: dict[str, jax.Array], forms: _Forms) -> list[jax.Array]:
+    taken, leaves = dict.fromkeys(packed, 0), []
+    for shape, dtype in forms:
+        begin, taken[dtype] = taken[dtype], taken[dtype] + math.prod(shape)
+        leaves.append(packed[dtype][begin : taken[dtype]].reshape(shape))
+    return leaves
 
 
 @functools.cache
 def _compiled(platform: str) -> Any:
-    return jax.jit(_block, static_argnames="kind", compiler_options=runtime.compiler_options(platform))
+    return jax.jit(_block, static_argnames=("kind", "forms"), compiler_options=runtime.compiler_options(platform))
 
 
 def _unwritten(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
