@@ -44,8 +44,9 @@ _STEPS_PER_BLOCK = 1 << 28
 _LARGEST_BLOCK = 1 << 30
 """Bytes of results."""
 
-_LARGEST_BLOCK_OF_A_CPU = 1 << 26
-"""Small enough for the memory of one block to serve the next: fresh memory is slower than a simulation."""
+_LARGEST_BLOCK_OF_A_CPU = 1 << 25
+"""Small enough for the memory of one block to serve the next, as glibc keeps what is freed up to this size: fresh memory
+is slower than a simulation."""
 
 _AXIS = "starts"
 _SHARED_OUT: Any = PartitionSpec(_AXIS)  # type: ignore[no-untyped-call]  # untyped in JAX
