@@ -1,7 +1,7 @@
 """How JAX is to use a CPU: its cores as devices, and two options of XLA's compiler.
 
 By default XLA's CPU compiler makes several functions of one step of a simulation, computes what they share in each, and
-calls them one after the other: most of the time goes there. What `sim/compilation.py` does about it needs no options,
+calls them one after the other: most of the time goes there. What `compilation.py` does about it needs no options,
 but for values two of the compiler's do more:
 
     xla_cpu_use_multi_output_fusion          what several results need is computed once

@@ -14,6 +14,8 @@ ROOT = Path(cpjax.__file__).parent
 ROOMS = [
     "errors",
     "pytree",
+    "runtime",
+    "compilation",
     "numeric",
     "state",
     "starts",
@@ -21,7 +23,6 @@ ROOMS = [
     "design",
     "controllers",
     "paper",
-    "runtime",
     "sim",
     "io",
     "presets",

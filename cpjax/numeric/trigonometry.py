@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from cpjax.compilation import part_of_step
 from cpjax.pytree import Scalar
 
 # Range reduction of Cody and Waite: pi/2 in three parts, the first short enough for n * part to be exact.
@@ -50,6 +51,14 @@ def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
     """
     angle = jnp.asarray(angle)
     angle = angle.astype(jnp.result_type(angle, float)) if not jnp.issubdtype(angle.dtype, jnp.floating) else angle
+    s, c, quadrant = part_of_step(_reduced)(angle)
+    odd = (quadrant & 1) == 1
+    sin, cos = jnp.where(odd, c, s), jnp.where(odd, s, c)
+    return jnp.where(quadrant >= 2, -sin, sin), jnp.where((quadrant == 1) | (quadrant == 2), -cos, cos)
+
+
+def _reduced(angle: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Sine and cosine of what is left of the angle beside whole quarters of a turn, and their number modulo 4."""
     wide = angle.dtype == jnp.float64
     half_pi, sin_terms, cos_terms = (_HALF_PI_64, _SIN_64, _COS_64) if wide else (_HALF_PI_32, _SIN_32, _COS_32)
     turns = lax.round(angle * (2.0 / math.pi), lax.RoundingMethod.TO_NEAREST_EVEN)
@@ -58,9 +67,7 @@ def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
     s = r + r * z * _horner(z, sin_terms)
     c = 1.0 - (0.5 * z - z * z * _horner(z, cos_terms))
     quadrant = turns.astype(jnp.int32) & 3
-    odd = (quadrant & 1) == 1
-    sin, cos = jnp.where(odd, c, s), jnp.where(odd, s, c)
-    return jnp.where(quadrant >= 2, -sin, sin), jnp.where((quadrant == 1) | (quadrant == 2), -cos, cos)
+    return s, c, quadrant
 
 
 @sin_cos.defjvp

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cpjax.compilation import one_function, part_of_step
 from cpjax.controllers.protocol import SmoothController
 from cpjax.plant import CartPole
-from cpjax.sim.compilation import one_function, part_of_step
 from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, Flag, unknown
 from cpjax.sim.integrators import INTEGRATORS, Integrator
 from cpjax.sim.kept import pack

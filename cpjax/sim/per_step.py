@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from cpjax import runtime
+from cpjax.compilation import one_function, part_of_step
 from cpjax.controllers.protocol import Controller
 from cpjax.numeric.trigonometry import sin_cos
 from cpjax.plant import CartPole
-from cpjax.sim.compilation import one_function, part_of_step
 from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, TURNED_FAR, Flag, unknown
 from cpjax.sim.integrators import INTEGRATORS
 from cpjax.sim.kept import pack
@@ -149,8 +149,14 @@ def _advance(
         after = step_continuous(plant, controller, method, safe, loop.mode, dt, safe_first)
     else:
         after = step_held(plant, method, safe, jnp.where(going, loop.voltage, 0.0), dt, safe_first)
-    good = going & within_bounds(after)
-    finite = jnp.isfinite(ahead[0] + ahead[1] + after.x + after.x_dot + after.theta + after.theta_dot)
+    within, finite = part_of_step(_judged)(after, ahead)
+    good = going & within
     reason = jnp.where(finite, np.int32(Flag.RUNAWAY), np.int32(Flag.NON_FINITE))
     state = jax.tree.map(lambda old, new: jnp.where(good, new, old), state, after)
     return loop._replace(state=state, flag=loop.flag | jnp.where(stopped | good, np.int32(0), reason) | far)
+
+
+def _judged(after: State, ahead: Pair) -> tuple[jax.Array, jax.Array]:
+    """Whether the state after a step is within the bounds, and whether all of that step's numbers are finite."""
+    total = ahead[0] + ahead[1] + after.x + after.x_dot + after.theta + after.theta_dot
+    return within_bounds(after), jnp.isfinite(total)

@@ -5,11 +5,11 @@ from typing import NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 
+from cpjax.compilation import part_of_step
 from cpjax.controllers.protocol import Controller, SmoothController
 from cpjax.numeric.trigonometry import LARGEST_TURN, sin_cos, turned
 from cpjax.plant import CartPole
 from cpjax.pytree import Scalar
-from cpjax.sim.compilation import part_of_step
 from cpjax.sim.integrators import Acceleration, Integrator
 from cpjax.sim.switching import Observation
 from cpjax.state import State
@@ -19,8 +19,12 @@ Pair: TypeAlias = tuple[Scalar, Scalar]
 
 def applied_voltage(plant: CartPole, controller: Controller, state: State, mode: jax.Array) -> jax.Array:
     """What the motor gets [V]: the law's demand in `mode`, in the state's dtype, clipped to the supply."""
-    demand = controller.mode_voltage(state, mode)
+    demand = part_of_step(_demand)(controller, state, mode)
     return plant.motor.saturate(jnp.asarray(demand, dtype=jnp.asarray(state.x).dtype))
+
+
+def _demand(controller: Controller, state: State, mode: jax.Array) -> Scalar:
+    return controller.mode_voltage(state, mode)
 
 
 def rates(plant: CartPole, direction: Pair, v: Pair, voltage: Scalar) -> Pair:

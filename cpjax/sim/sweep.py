@@ -45,7 +45,7 @@ _LARGEST_BLOCK = 1 << 30
 """Bytes of results."""
 
 _LARGEST_BLOCK_OF_A_CPU = 1 << 25
-"""Small enough for the memory of one block to serve the next, as glibc keeps what is freed up to this size: fresh memory
+"""Small enough for the memory of one block to serve the next (glibc keeps what is freed up to this size): fresh memory
 is slower than a simulation."""
 
 _AXIS = "starts"

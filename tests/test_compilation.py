@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import cpjax
-from cpjax import paper, runtime
+from cpjax import compilation, paper, runtime
 from cpjax.numeric.differences import central_differences
 from cpjax.pytree import number, pytree
-from cpjax.sim import compilation
 
 PLANT = paper.appendix_plant()
 CENTRED = paper.controller("corrected-centred", "placement", PLANT)
