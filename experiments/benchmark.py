@@ -142,18 +142,17 @@ def _table(rows: list[dict[str, Any]]) -> None:
 
 
 def _picture(path: Path, rows: list[dict[str, Any]]) -> None:
-    figure = Figure(figsize=(13, 7), layout="constrained")
+    figure = Figure(figsize=(13, 9), layout="constrained")
     left, right = figure.subplots(1, 2)
     for name in ("C", "cpjax"):
         grown = [row for row in rows if row["name"] == name and row["steps"] == 1000 and "problem" not in row]
         left.loglog([row["starts"] for row in grown], [row["steps_per_second"] for row in grown], "o-", label=name)
     left.set(xlabel="starts", ylabel="steps per second", title="float32, 1,000 steps, all cores")
     left.legend()
-    bars = [row for row in rows if row["starts"] in (64, 4096, 65536, 1, 2) and row["steps"] == STEPS]
-    bars = [row for row in bars if "problem" not in row]
-    labels = [f"{row['name']} ({row['starts']:,}, {row['dtype'][5:]})" for row in bars]
+    bars = [row for row in rows if "problem" not in row and (row["steps"] == STEPS or row["name"] == "SciPy")]
+    labels = [f"{row['name']} ({row['starts']:,}, {row['dtype'][5:]} bit, {row['cores']})" for row in bars]
     right.barh(labels, [row["steps_per_second"] for row in bars])
-    right.set(xscale="log", xlabel="steps per second", title="all contenders")
+    right.set(xscale="log", xlabel="steps per second", title="all contenders (starts, precision, cores)")
     right.invert_yaxis()
     save_figure(path, figure)
 
