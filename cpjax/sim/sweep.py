@@ -276,14 +276,40 @@ def _block(columns: list[jax.Array], packed: dict[str, jax.Array], kind: _Kind, 
         def chunk(column: list[jax.Array]) -> Any:
             return jax.vmap(lambda lane: _one(lane, shared, kind), out_axes=(1, 0, 0))(column)
 
+        def packed_chunk(column: list[jax.Array]) -> Any:
+            kept, *others = chunk(column)
+            return kept, _stacked(others)
+
         chunks = [column.reshape(-1, kind.chunk, *column.shape[1:]) for column in columns]
-        kept, last, result = jax.lax.map(chunk, chunks)
+        kept, others = jax.lax.map(packed_chunk, chunks)
+        last, result = _unstacked(others, jax.eval_shape(chunk, [column[0] for column in chunks])[1:])
         kept = jax.tree.map(lambda part: jnp.moveaxis(part, 1, 0), kept)  # rows first
         trees = results(kept, last, result), last.flag
         return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), trees)
 
     specs = {"in_specs": (_SHARED_OUT, _EVERYWHERE), "out_specs": _SHARED_OUT}
     return jax.shard_map(share, mesh=kind.mesh, check_vma=False, **specs)(columns, packed)
+
+
+def _stacked(tree: Any) -> list[jax.Array]:
+    """Leaves of a kind as one array: of several, XLA copies all that a loop has written at every write."""
+    kinds: dict[Any, list[jax.Array]] = {}
+    for leaf in jax.tree.leaves(tree):
+        kinds.setdefault((leaf.shape, leaf.dtype), []).append(leaf)
+    return [jnp.stack(leaves) for leaves in kinds.values()]
+
+
+def _unstacked(stacks: list[jax.Array], like: Any) -> Any:
+    """What `_stacked` was given, of the shapes `like`; all with a leading axis more."""
+    leaves, structure = jax.tree.flatten(like)
+    kinds = list(dict.fromkeys((leaf.shape, leaf.dtype) for leaf in leaves))
+    taken = dict.fromkeys(kinds, -1)
+    found = []
+    for leaf in leaves:
+        kind = (leaf.shape, leaf.dtype)
+        taken[kind] += 1
+        found.append(stacks[kinds.index(kind)][:, taken[kind]])
+    return jax.tree.unflatten(structure, found)
 
 
 def _unpacked(packed: dict[str, jax.Array], forms: _Forms) -> list[jax.Array]:
