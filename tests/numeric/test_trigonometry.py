@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cpjax.numeric.trigonometry import sin_cos, wrap_angle
+from cpjax.numeric.trigonometry import LARGEST_TURN, sin_cos, turned, wrap_angle
 
 LARGEST = 1e4  # the angle up to which the accuracy is promised
 WIDER = {np.float32: np.float64, np.float64: np.longdouble}
@@ -94,6 +94,34 @@ def test_a_tangent_passes_through_linearly_and_batches():
     _, pushed = jax.jvp(jax.vmap(sin_cos), (angle,), (tangent,))
     np.testing.assert_allclose(pushed[0], np.cos(angle) * tangent, rtol=1e-15)
     np.testing.assert_allclose(pushed[1], -np.sin(angle) * tangent, rtol=1e-15)
+
+
+@DTYPES
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_turned_sine_and_cosine_are_within_two_ulp_of_one(dtype, compiled):
+    rng = np.random.default_rng(5)
+    angle = rng.uniform(-math.pi, math.pi, 200_000).astype(dtype)
+    turn = (rng.choice([-1.0, 1.0], angle.size) * LARGEST_TURN * rng.uniform(0.0, 1.0, angle.size)).astype(dtype)
+    turn[:2] = dtype(LARGEST_TURN), -dtype(LARGEST_TURN)
+    wide = WIDER[dtype](angle)
+    known = (np.sin(wide).astype(dtype), np.cos(wide).astype(dtype))  # correctly rounded: half an ulp off
+    got = (jax.jit(turned) if compiled else turned)(*map(jnp.asarray, known), jnp.asarray(turn))
+    exact = wide + WIDER[dtype](turn)
+    for value, reference in zip(got, (np.sin(exact), np.cos(exact)), strict=True):
+        assert value.dtype == dtype
+        assert np.max(np.abs(np.asarray(value) - reference)) <= 2 * np.finfo(dtype).eps
+
+
+@DTYPES
+def test_the_derivative_of_a_turn_is_that_of_sine_and_cosine(dtype):
+    turn = jnp.linspace(-LARGEST_TURN, LARGEST_TURN, 101, dtype=dtype)
+    known = sin_cos(jnp.asarray(1.1, dtype))
+    for mode in (jax.jacfwd, jax.jacrev):
+        slopes = jax.vmap(mode(lambda by: turned(*known, by)))(turn)
+        exact = np.cos(1.1 + np.asarray(turn, float)), -np.sin(1.1 + np.asarray(turn, float))
+        for slope, reference in zip(slopes, exact, strict=True):
+            # That of the series, which ends a power earlier.
+            np.testing.assert_allclose(slope, reference, rtol=0, atol=1e-12 if dtype == np.float64 else 1e-6)
 
 
 @DTYPES
