@@ -2,12 +2,13 @@
 
     python experiments/benchmark.py
 
-Every contender runs in a process of its own (`benchmark/contenders.py`), on the same cores, one after another; the best
-of three runs counts. C needs a C compiler. The other packages are optional, and those that are missing are named:
-`pip install --constraint constraints.txt '.[benchmark,peers]'`; for jaxonomy, which needs an older JAX, an environment
-of its own with `pip install jaxonomy tomli-w rich optax`, whose Python is named in JAXONOMY_PYTHON. Ratios are to the C
-code at the same precision, which does the same work as cpjax (law, kick, gate, flags and all metrics); the others do
-less, as `contenders.py` says of each. Measured and written after each contender: benchmark.json, benchmark.png.
+Every contender runs in a process of its own (`benchmark/contenders.py`), on the same cores, one after another; the
+best of at least three runs, and of at least two seconds, counts. C needs a C compiler. The other packages are
+optional, and those that are missing are named: `pip install --constraint constraints.txt '.[benchmark,peers]'`; for
+jaxonomy, which needs an older JAX, an environment of its own with `pip install jaxonomy tomli-w rich optax`, whose
+Python is named in JAXONOMY_PYTHON. Ratios are to the C code at the same precision, which does the same work as cpjax
+(law, kick, gate, flags and all metrics); the others do less, as `contenders.py` says of each. Measured and written
+after each contender: benchmark.json, benchmark.png.
 """
 
 import json
