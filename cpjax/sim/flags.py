@@ -31,8 +31,8 @@ STOPPED = int(Flag.RUNAWAY | Flag.NON_FINITE | Flag.OVERFLOW)
 
 CHATTER_LENGTH = 8
 
-TURNED_FAR = 1 << 30
-"""Beside the flags, for `sweep` alone, which then computes the start again: see `Settings.turns`."""
+IN_DOUBT = 1 << 30
+"""Beside the flags, for `sweep` alone, which then computes the start again: see `Settings.optimistic`."""
 
 
 def describe(flag: int) -> str:

@@ -15,7 +15,7 @@ from cpjax.compilation import one_function, part_of_step
 from cpjax.controllers.protocol import Controller
 from cpjax.numeric.trigonometry import sin_cos
 from cpjax.plant import CartPole
-from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, TURNED_FAR, Flag, unknown
+from cpjax.sim.flags import CHATTER_LENGTH, IN_DOUBT, STOPPED, Flag, unknown
 from cpjax.sim.integrators import INTEGRATORS
 from cpjax.sim.kept import pack
 from cpjax.sim.metrics import Fold, Sample
@@ -53,14 +53,16 @@ def simulate(
     none = jnp.zeros_like(start.x, dtype=jnp.int32)
     mode = controller.start_mode(start)
     voltage = applied_voltage(plant, controller, start, mode)
-    loop = _Loop(start, mode, voltage, unknown((start, plant, controller)), none)
+    flag = unknown((start, plant, controller))
+    flag = jnp.where(flag != 0, np.int32(IN_DOUBT), flag) if settings.optimistic else flag
+    loop = _Loop(start, mode, voltage, flag, none)
     _, first, _ = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
 
     carry = (loop, fold.init(first))
     run = one_function(functools.partial(_run, settings=settings), stacks=True)
     (loop, memory), samples = run(carry, plant, controller, fold, dt)
     _, last, _ = _observe(plant, controller, loop, jnp.asarray(settings.steps), dt, settings)
-    clean = last._replace(flag=last.flag & ~TURNED_FAR)
+    clean = last._replace(flag=last.flag & ~IN_DOUBT)
     return samples, last, fold.finish(fold.update(memory, clean), clean)
 
 
@@ -107,11 +109,12 @@ def _observe(
         voltage = jnp.where(instant, voltage, loop.voltage)
         changes = jnp.where(instant, changes, loop.changes)
     flag = loop.flag | jnp.where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
+    going = jnp.asarray(True) if settings.optimistic else (flag & STOPPED) == 0
     direction = sin_cos(state.theta)
     accelerations = part_of_step(rates)(plant, direction, (state.x_dot, state.theta_dot), voltage)
     sample = Sample(
         time=index.astype(dt.dtype) * dt,
-        elapsed=jnp.where((index > 0) & ((flag & STOPPED) == 0), dt, 0.0),
+        elapsed=jnp.where((index > 0) & going, dt, 0.0),
         state=state,
         voltage=voltage,
         voltage_since=loop.voltage,
@@ -136,16 +139,18 @@ def _advance(
     from upright rest, where all is finite, and dropped. (A law that is itself not finite at a state it is asked about
     still gives NaN derivatives; those of this library are finite.)
     """
-    state, method, far = loop.state, INTEGRATORS[settings.integrator], jnp.zeros_like(loop.flag)
+    state, method = loop.state, INTEGRATORS[settings.integrator]
     first, direction = instant
-    stopped = (loop.flag & STOPPED) != 0
     ahead = state.x_dot + dt * first[0], state.theta_dot + dt * first[1]
-    going = ~stopped & (jnp.abs(ahead[0]) <= RUNAWAY_LIMIT) & (jnp.abs(ahead[1]) <= RUNAWAY_LIMIT)
-    safe, safe_first = jax.tree.map(lambda value: jnp.where(going, value, 0.0), (state, first))
-    if settings.turns:  # values only, so nothing has to be safe
+    possible = (jnp.abs(ahead[0]) <= RUNAWAY_LIMIT) & (jnp.abs(ahead[1]) <= RUNAWAY_LIMIT)
+    if settings.optimistic:
         after, near = step_held_by_turns(plant, method, state, direction, loop.voltage, dt, first)
-        far = jnp.where(going & ~near, np.int32(TURNED_FAR), np.int32(0))
-    elif settings.clock == "continuous":
+        right = possible & near & within_bounds(after)
+        return loop._replace(state=after, flag=loop.flag | jnp.where(right, np.int32(0), np.int32(IN_DOUBT)))
+    stopped = (loop.flag & STOPPED) != 0
+    going = ~stopped & possible
+    safe, safe_first = jax.tree.map(lambda value: jnp.where(going, value, 0.0), (state, first))
+    if settings.clock == "continuous":
         after = step_continuous(plant, controller, method, safe, loop.mode, dt, safe_first)
     else:
         after = step_held(plant, method, safe, jnp.where(going, loop.voltage, 0.0), dt, safe_first)
@@ -153,7 +158,7 @@ def _advance(
     good = going & within
     reason = jnp.where(finite, np.int32(Flag.RUNAWAY), np.int32(Flag.NON_FINITE))
     state = jax.tree.map(lambda old, new: jnp.where(good, new, old), state, after)
-    return loop._replace(state=state, flag=loop.flag | jnp.where(stopped | good, np.int32(0), reason) | far)
+    return loop._replace(state=state, flag=loop.flag | jnp.where(stopped | good, np.int32(0), reason))
 
 
 def _judged(after: State, ahead: Pair) -> tuple[jax.Array, jax.Array]:

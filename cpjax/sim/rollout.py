@@ -17,7 +17,7 @@ from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.pytree import cast, check, pytree
 from cpjax.sim import located, per_step
-from cpjax.sim.flags import TURNED_FAR
+from cpjax.sim.flags import IN_DOUBT
 from cpjax.sim.kept import Kept, fields, keep
 from cpjax.sim.metrics import Fold, ProtocolMetrics, Sample
 from cpjax.sim.settings import Checkpoint, Clock, Settings, Switching, check_settings
@@ -133,7 +133,7 @@ def simulate(
     start: State, plant: CartPole, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
 ) -> tuple[Kept | None, Sample, Any]:
     """Of arguments that have been checked and cast: what is kept of all samples but the last (None if nothing is), the
-    last one (its flag may have TURNED_FAR), and what the fold made of all of them."""
+    last one (its flag may have IN_DOUBT), and what the fold made of all of them."""
     one = located.simulate if settings.switching == "located" else per_step.simulate
     packed, last, result = one(start, plant, controller, fold, dt, settings)
     return (None if packed is None else keep(packed, plant)), last, result
@@ -143,7 +143,7 @@ def results(kept: Kept | None, last: Sample, result: Any) -> Any:
     """What users get of what `simulate` returned: a `Trajectory`, or only what the fold made of it."""
     if kept is None:
         return result
-    return Trajectory(**fields(kept, last), flag=last.flag & ~TURNED_FAR, metrics=result)  # type: ignore[arg-type]  # of a dict
+    return Trajectory(**fields(kept, last), flag=last.flag & ~IN_DOUBT, metrics=result)  # type: ignore[arg-type]  # of a dict
 
 
 def _without_designs(controller: Any) -> Any:

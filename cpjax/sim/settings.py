@@ -25,8 +25,9 @@ class Settings(NamedTuple):
     """Beyond `steps`, for crossings; 0 where none are located."""
     integrator: str
     checkpoint: Checkpoint
-    turns: bool = False
-    """Held steps by `step_held_by_turns`; a start for which that was not accurate has the flag `TURNED_FAR`."""
+    optimistic: bool = False
+    """Values only: held steps by `step_held_by_turns`, and no run is held where it goes wrong. A start for which that
+    was not right has the flag `IN_DOUBT`, and all else about it means nothing."""
 
 
 def check_settings(

@@ -22,7 +22,7 @@ from cpjax.controllers.protocol import Controller, Law
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.pytree import is_traced
-from cpjax.sim.flags import TURNED_FAR
+from cpjax.sim.flags import IN_DOUBT
 from cpjax.sim.kept import Kept
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.rollout import cast_arguments, results, simulate
@@ -187,11 +187,13 @@ class Work(NamedTuple):
 
     def _collect(self, begin: int, results: Any) -> Any:
         result, flag = jax.tree.map(_gather, results)
-        far = (flag & TURNED_FAR) != 0
-        if np.any(far):
-            settings = self.kind.settings._replace(turns=False)
+        doubtful = (flag & IN_DOUBT) != 0
+        if np.any(doubtful):
+            settings = self.kind.settings._replace(optimistic=False)
             in_full, _ = jax.tree.map(_gather, self._compute(begin, self.kind._replace(settings=settings)))
-            result = jax.tree.map(lambda a, b: np.where(far.reshape(-1, *[1] * (a.ndim - 1)), b, a), result, in_full)
+            result = jax.tree.map(
+                lambda a, b: np.where(doubtful.reshape(-1, *[1] * (a.ndim - 1)), b, a), result, in_full
+            )
         return jax.tree.map(lambda array: array[: self.total - begin], result)
 
 
@@ -220,7 +222,7 @@ def prepare(
     settings = check_settings(
         duration, dt, clock, control_period, switching, integrator, save_every, spare_steps, checkpoint
     )
-    settings = settings._replace(turns=clock == "sampled")
+    settings = settings._replace(optimistic=clock == "sampled")
     starts, dtype = checked_start(starts, "starts", batched=True)
     total = int(jnp.shape(starts.x)[0])
     arguments, batched = cast_arguments(plant, controller, metrics, dt, dtype, settings, batch=total)

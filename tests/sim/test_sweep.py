@@ -16,6 +16,7 @@ from oracles import columns
 import cpjax
 from cpjax import Flag, paper
 from cpjax.errors import InputError
+from cpjax.pytree import pytree
 
 PLANT = paper.appendix_plant()
 CENTRED = paper.controller("corrected-centred", "placement", PLANT)
@@ -72,11 +73,25 @@ def test_a_pole_too_fast_for_turns_is_computed_in_full(speed):
     assert set(np.asarray(batch.flag).tolist()) <= {0, int(Flag.RUNAWAY)}
 
 
-def test_a_runaway_is_flagged_as_in_a_rollout():
-    starts = cpjax.State(np.array([0.0, 999.0]), np.array([0.0, 900.0]), np.array([3.0, 3.0]), np.zeros(2))
-    batch = cpjax.sweep(PLANT, CENTRED, starts, duration=0.1, **SAMPLED)
-    assert batch.flag.tolist() == [0, int(Flag.RUNAWAY)]
-    assert not batch.success[1]
+@pytree
+class Poisoned:
+    """NaN beyond a speed of the cart."""
+
+    def voltage(self, state):
+        return jnp.where(jnp.abs(state.x_dot) > 1.0, jnp.nan, 3.0)
+
+
+def test_runs_that_go_wrong_are_held_and_flagged_as_in_a_rollout():
+    wrong = cpjax.State(np.array([0.0, 999.0]), np.array([0.0, 900.0]), np.array([3.0, 3.0]), np.zeros(2))
+    slow_and_fast = cpjax.State(np.zeros(2), np.array([-1.0, 0.9]), np.array([3.0, 3.0]), np.zeros(2))
+    for law, starts, flag in ((CENTRED, wrong, Flag.RUNAWAY), (Poisoned(), slow_and_fast, Flag.NON_FINITE)):
+        batch = cpjax.sweep(PLANT, law, starts, duration=0.1, **SAMPLED)
+        assert batch.flag.tolist() == [0, int(flag)]
+        assert not batch.success[1]
+        for i in range(2):
+            start = jax.tree.map(lambda column, i=i: float(column[i]), starts)
+            alone = cpjax.measure(PLANT, law, start, duration=0.1, **SAMPLED)
+            assert_same(jax.tree.map(lambda column, i=i: column[i], batch), alone, rtol=1e-9)
 
 
 def test_trajectories_are_those_of_rollouts():
