@@ -161,7 +161,7 @@ def _positive_definite(name: str, P: jax.Array, size: int | None = None) -> jax.
     n = square(name, P)
     shaped(name, P, (size or n,) * 2)
     P = 0.5 * (P + P.T)
-    definite = _is_positive_definite(lax.stop_gradient(P))  # a yes or no, which has no derivative
+    definite = _is_positive_definite(P)
     if not is_traced(definite) and not definite:
         raise InputError(name, P, "positive definite, by a margin that rounding leaves visible")
     return jnp.where(definite, P, jnp.nan)

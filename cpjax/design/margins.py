@@ -410,7 +410,6 @@ def _peak(loop: _Loop, scale: jax.Array, frequencies: jax.Array) -> _Margin:
     bounded = jnp.isfinite(ascent.frequency)
     polished, valid = _root(_excess_slope, jnp.where(bounded, ascent.frequency, 0.0), loop, scale)
     # Newton's method may have gone to another stationary point.
-    height = _excess(lax.stop_gradient(polished), fixed)  # for a yes or no only, which has no derivative
-    same = valid & (height > 0.999 * ascent.level)
+    same = valid & (_excess(polished, fixed) > 0.999 * ascent.level)
     frequency = jnp.where(same, polished, ascent.frequency)
     return jnp.where(bounded, _excess(jnp.where(bounded, frequency, scale), loop), 0.0), frequency

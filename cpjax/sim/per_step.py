@@ -109,6 +109,7 @@ def _observe(
         voltage = jnp.where(instant, voltage, loop.voltage)
         changes = jnp.where(instant, changes, loop.changes)
     flag = loop.flag | jnp.where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
+    # Optimistic, no run is stopped: one that should be is in doubt.
     going = jnp.asarray(True) if settings.optimistic else (flag & STOPPED) == 0
     direction = sin_cos(state.theta)
     accelerations = part_of_step(rates)(plant, direction, (state.x_dot, state.theta_dot), voltage)
@@ -143,7 +144,7 @@ def _advance(
     first, direction = instant
     ahead = state.x_dot + dt * first[0], state.theta_dot + dt * first[1]
     possible = (jnp.abs(ahead[0]) <= RUNAWAY_LIMIT) & (jnp.abs(ahead[1]) <= RUNAWAY_LIMIT)
-    if settings.optimistic:
+    if settings.optimistic:  # values only, so nothing has to be safe, and what went wrong is computed again
         after, near = step_held_by_turns(plant, method, state, direction, loop.voltage, dt, first)
         right = possible & near & within_bounds(after)
         return loop._replace(state=after, flag=loop.flag | jnp.where(right, np.int32(0), np.int32(IN_DOUBT)))
