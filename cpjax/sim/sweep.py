@@ -157,7 +157,8 @@ class Work(NamedTuple):
         """
         waiting: tuple[int, Any] | None = None
         for begin in begins:
-            ahead = (begin, self._compute(begin, self.kind))
+            members = np.minimum(np.arange(begin, begin + self.size), self.total - 1)
+            ahead = (begin, self._compute(members, self.kind))
             if waiting is not None:
                 yield self._collect(*waiting)
             waiting = ahead
@@ -170,9 +171,8 @@ class Work(NamedTuple):
         first = [column[0] for column in columns]
         return jax.tree.structure(jax.eval_shape(lambda: results(*_one(first, shared, self.kind))))
 
-    def _compute(self, begin: int, kind: _Kind) -> Any:
-        """Results and flags of a block, still being computed."""
-        members = np.minimum(np.arange(begin, begin + self.size), self.total - 1)
+    def _compute(self, members: np.ndarray, kind: _Kind) -> Any:
+        """Results and flags of these starts, still being computed."""
         columns, shared = _split(self.leaves, kind.batched)
         placed = [_place(np.asarray(column)[members], NamedSharding(kind.mesh, _SHARED_OUT)) for column in columns]
         # As few arrays as can be: to hand over dozens takes longer than a small sweep.
@@ -186,15 +186,19 @@ class Work(NamedTuple):
         return _compiled(kind.mesh.devices.flat[0].platform)(placed, replicated, kind, forms)
 
     def _collect(self, begin: int, results: Any) -> Any:
-        result, flag = jax.tree.map(_gather, results)
-        doubtful = (flag & IN_DOUBT) != 0
-        if np.any(doubtful):
-            settings = self.kind.settings._replace(optimistic=False)
-            in_full, _ = jax.tree.map(_gather, self._compute(begin, self.kind._replace(settings=settings)))
-            result = jax.tree.map(
-                lambda a, b: np.where(doubtful.reshape(-1, *[1] * (a.ndim - 1)), b, a), result, in_full
-            )
-        return jax.tree.map(lambda array: array[: self.total - begin], result)
+        result, flag = jax.tree.map(lambda array: _gather(array)[: self.total - begin], results)
+        doubtful = np.flatnonzero(flag & IN_DOUBT)
+        if doubtful.size:
+            result = jax.tree.map(np.array, result)  # may be written to
+            kind = self.kind._replace(settings=self.kind.settings._replace(optimistic=False))
+            together = kind.chunk * kind.mesh.size
+            for first in range(0, doubtful.size, together):
+                rows = doubtful[first : first + together]
+                members = np.resize(begin + rows, together)  # always as many: one compilation
+                in_full, _ = jax.tree.map(_gather, self._compute(members, kind))
+                for array, again in zip(jax.tree.leaves(result), jax.tree.leaves(in_full), strict=True):
+                    array[rows] = again[: rows.size]
+        return result
 
 
 def prepare(
