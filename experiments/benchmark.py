@@ -47,6 +47,7 @@ OTHERS: dict[str, tuple[int, int, int]] = {
     "C, one start": (1, STEPS, 1),
     "cpjax, one start": (1, STEPS, 1),
     "cpjax, one start, under jit": (1, STEPS, 1),
+    "cpjax, one start, 10 ms": (1, STEPS, 1),
     "cpjax, values of 64": (64, STEPS, 1),
     "cpjax, gradient": (64, STEPS, 1),
     "cpjax, gradient with options": (64, STEPS, 1),

@@ -42,7 +42,7 @@ def _travel(found: Any) -> Any:
     return getattr(found, "metrics", found).cart_travel
 
 
-def cpjax_one(task: Task, compiled: bool = False) -> Run:
+def cpjax_one(task: Task, compiled: bool = False, **other: Any) -> Run:
     """One start after another, by `cpjax.measure`, as it is or under the caller's `jax.jit`."""
     import jax
 
@@ -51,7 +51,7 @@ def cpjax_one(task: Task, compiled: bool = False) -> Run:
     plant, controller = problem()
 
     def measure(start: Any, steps: int) -> Any:
-        return cpjax.measure(plant, controller, start, **settings(steps))
+        return cpjax.measure(plant, controller, start, **(settings(steps) | other))
 
     one = jax.jit(measure, static_argnums=1) if compiled else measure
 
@@ -100,6 +100,8 @@ def c_roofline(task: Task, one: bool = False) -> Run:
     return lambda starts, steps: roofline.run(library, plant, controller, starts, steps, DT, threads).cart_travel
 
 
+LONG_STEPS: dict[str, Any] = {"dt": 0.01, "clock": "continuous", "switching": "located"}
+
 CONTENDERS: dict[str, tuple[Callable[[Task], Run], str]] = {
     "C": (c_roofline, "by hand in C"),
     "C, one start": (partial(c_roofline, one=True), "by hand in C, compiled for one start"),
@@ -109,6 +111,7 @@ CONTENDERS: dict[str, tuple[Callable[[Task], Run], str]] = {
     "cpjax, every sample": (partial(cpjax_sweep, save_every=1), "trajectories"),
     "cpjax, one start": (cpjax_one, "cpjax.measure, one start after another"),
     "cpjax, one start, under jit": (partial(cpjax_one, compiled=True), "cpjax.measure under jax.jit"),
+    "cpjax, one start, 10 ms": (partial(cpjax_one, compiled=True, **LONG_STEPS), "continuous clock, steps of 10 ms"),
     "cpjax, values of 64": (partial(cpjax_gradient, reverse=False), "a cost, under vmap"),
     "cpjax, gradient": (cpjax_gradient, "a cost and its gradient, reverse mode"),
     "cpjax, gradient with options": (cpjax_gradient, "the same after cpjax.configure_cpu"),
@@ -127,8 +130,8 @@ CONTENDERS: dict[str, tuple[Callable[[Task], Run], str]] = {
 CONFIGURED = ("cpjax", "cpjax, every 10th sample", "cpjax, every sample", "cpjax, gradient with options")
 """Those after `cpjax.configure_cpu`, which is for all of them but the gradient."""
 
-CONTINUOUS = ("diffrax, Heun", "diffrax, Tsit5", "jaxonomy, RK4", "jaxonomy, its own steps")
-"""Those on the other clock: their carts go nearly as far."""
+CONTINUOUS = ("cpjax, one start, 10 ms", "diffrax, Heun", "diffrax, Tsit5", "jaxonomy, RK4", "jaxonomy, its own steps")
+"""Those on the other clock, checked on it against steps of 2 ms through located switches."""
 
 
 SECONDS = 2.0
@@ -165,7 +168,7 @@ def measure(name: str, task: Task) -> dict[str, Any]:
     found = np.asarray(run(few, CHECKED_STEPS), float)
     exact = jax.tree.map(lambda column: np.asarray(column, float), few)
     plant, controller = problem()
-    clock = {"clock": "continuous"} if name in CONTINUOUS else {}
+    clock = {"clock": "continuous", "switching": "located"} if name in CONTINUOUS else {}
     right = np.asarray(cpjax.sweep(plant, controller, exact, **(settings(CHECKED_STEPS) | clock)).cart_travel)
     return {
         "name": name,
