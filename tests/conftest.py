@@ -9,6 +9,13 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
+@pytest.fixture(autouse=True, scope="module")
+def forget_compilations():
+    """What a file compiled no other uses; kept, it is gigabytes in the end."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def command(capsys):
     """Runs a command; its exit code, standard output and standard error."""

@@ -46,7 +46,9 @@ def random_problem(n, m, rng):
 
 
 @both
-@pytest.mark.parametrize(("n", "m"), [(2, 3), (4, 1), pytest.param(16, 3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("n", "m"), [(2, 3), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((4, 1), (16, 3)))]
+)
 def test_gains_and_solutions_are_those_of_scipy_and_python_control_with_a_cross_term_and_any_number_of_inputs(
     time, n, m
 ):

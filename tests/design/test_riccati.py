@@ -20,6 +20,10 @@ SOLVERS = {"continuous": solve_care, "discrete": solve_dare}
 BATCHED = {time: jax.jit(jax.vmap(solve)) for time, solve in SOLVERS.items()}
 LANES = 40
 both = pytest.mark.parametrize("time", SOLVERS)
+# What is done to the arguments is the same code for both.
+continuous_discrete_slow = pytest.mark.parametrize(
+    "time", ["continuous", pytest.param("discrete", marks=pytest.mark.slow)]
+)
 
 ONE = np.eye(1)
 
@@ -123,7 +127,7 @@ def test_the_closed_loop_is_stable_and_the_solution_symmetric_and_semidefinite(t
         assert np.min(np.linalg.eigvalsh(one / size / size[:, None])) >= -1e-12
 
 
-@both
+@continuous_discrete_slow
 def test_only_the_symmetric_part_of_a_weight_counts(time):
     A, B, Q = np.array([[0.0, 1.0], [1.2, 0.3]]), np.array([[0.0], [1.0]]), np.array([[2.0, 1.0], [1.0, 3.0]])
     skew = np.array([[0.0, 1.0], [-1.0, 0.0]])
@@ -322,7 +326,7 @@ def test_arguments_that_do_not_fit_are_refused_by_name(time, name):
     assert caught.value.field == field
 
 
-@both
+@continuous_discrete_slow
 def test_lists_whole_numbers_and_mixed_precision_are_welcome_and_the_widest_dtype_is_kept(time):
     right = SOLVERS[time]([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]], np.eye(2), ONE)
     whole = ([[0, 1], [2, -1]], [[0], [1]], [[1, 0], [0, 1]], [[1]])

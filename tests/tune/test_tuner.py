@@ -121,7 +121,7 @@ def test_a_start_that_cannot_be_simulated_does_no_harm(tuner):
     starts, _ = tuner._draw(2, 1, 0)
     bad = dataclasses.replace(starts, theta_dot=jnp.asarray([0.1, jnp.nan]))
     vectors = jnp.asarray(tuner.begin().vectors)
-    loss, slope = tuner.gradient(vectors, bad, None, jnp.asarray(0.2))
+    loss, slope = tuner.gradient(vectors, bad, None, jnp.asarray(0.2, vectors.dtype))
     assert np.all(np.isfinite(slope))
     assert np.all(np.isfinite(loss))
 
