@@ -14,5 +14,6 @@ def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]
     for row in rows:
         table.add_row(*row)
     # Where the width is not known (a file, a pipe) lines are as long as they need to be.
-    console = Console() if Console().is_terminal else Console(width=200)
+    width = None if Console().is_terminal else 200
+    console = Console(width=width, markup=False)  # [s] is a unit, not a style
     console.print(table)
