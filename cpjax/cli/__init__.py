@@ -32,7 +32,7 @@ class _Parser(argparse.ArgumentParser):
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    from cpjax.cli import audit_gains, audit_gradients, compare, design, report, reproduce, sweep, swingup, tune
+    from cpjax.cli import audit_gains, audit_gradients, basin, compare, design, report, reproduce, sweep, swingup, tune
 
     parser = _Parser(
         prog="cpjax",
@@ -42,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
-    for module in (swingup, sweep, design, reproduce, audit_gains, audit_gradients, tune, compare, report):
+    for module in (swingup, sweep, design, reproduce, audit_gains, audit_gradients, tune, compare, basin, report):
         module.add_command(commands)
     return parser
 

@@ -9,7 +9,7 @@ import argparse
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -49,7 +49,8 @@ class Option:
     help: str
     type: type = str
     choices: Sequence[str] | None = None
-    count: int | None = None
+    count: int | Literal["+"] | None = None
+    """How many values; "+" for one or more."""
     flag: str | None = None
     numbers: bool = False
     """Whether a file may give a text as a number."""
@@ -189,8 +190,10 @@ def _checked_value(field: str, value: Any, option: Option) -> Any:
     kinds = {float: ((int, float), "a number"), int: ((int,), "a whole number"), str: ((str,), "a text")}
     python_types, words = kinds[option.type]
     several = option.count is not None
-    if several and not (isinstance(value, list) and len(value) == option.count):
-        raise InputError(field, value, f"a list of {option.count} values")
+    if several and not (isinstance(value, list) and value and option.count in ("+", len(value))):
+        raise InputError(
+            field, value, "a list of values" if option.count == "+" else f"a list of {option.count} values"
+        )
     if option.numbers:
         value = [str(v) if isinstance(v, (int, float)) and not isinstance(v, bool) else v for v in value]
     for one in value if several else [value]:
@@ -226,15 +229,7 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
     if file is not None:
         if changes:
             raise InputError("controller", file, "alone, without " + ", ".join(changes))
-        for design, name in PRESETS.items():
-            if file == name:
-                return preset(design)
-        try:
-            return as_controller(io.load(file))
-        except InputError as problem:
-            if problem.field != "controller":
-                raise
-            raise InputError("controller", file, "a file that holds a controller or a law") from problem
+        return saved_controller(file)
     name = changes.pop("law", "corrected-centred")
     law: Any = paper.LAWS[name](plant)  # a dataclass, which the protocol that annotates it does not say
     law_changes = {key: changes.pop(key) for key in list(changes) if key in rules(EnergySwingUp)}
@@ -247,6 +242,35 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
     regulator = _build_regulator(changes, plant, reference)
     gate = _build_gate(changes, plant, reference, weights)
     return Hybrid(swing_up, regulator, gate)
+
+
+def saved_controller(name: str) -> Controller:
+    """The preset of this name, or what the file of this name holds."""
+    for design, known in PRESETS.items():
+        if name == known:
+            return preset(design)
+    try:
+        return as_controller(io.load(name))
+    except InputError as problem:
+        if problem.field != "controller":
+            raise
+        raise InputError("controller", name, "a file that holds a controller or a law") from problem
+
+
+def named_hybrid(name: str, plant: CartPole) -> Hybrid:
+    """A controller in one word: a preset, a file, or the paper's LAW/DESIGN or LAW/DESIGN/GAINS."""
+    law, *others = name.split("/")
+    if law in paper.LAWS and Path(name).suffix.lower() not in (".json", ".toml"):
+        words = dict(zip(("design", "gains"), others, strict=False))
+        known = {"design": get_args(paper.Design), "gains": get_args(paper.Gains)}
+        if not 1 <= len(others) <= 2 or any(word not in known[key] for key, word in words.items()):
+            raise InputError("controller", name, f"{law}/lqr or {law}/placement, and after it /printed or /computed")
+        design, gains = words["design"], words.get("gains", "printed")
+        return paper.controller(law, design, plant, gains)  # type: ignore[arg-type]  # seen to be among the known
+    controller = saved_controller(name)
+    if not isinstance(controller, Hybrid):
+        raise InputError("controller", name, "a Hybrid: a regulator behind a gate")
+    return controller
 
 
 def build_hybrid(given: Mapping[str, Any], plant: CartPole) -> Hybrid:

@@ -1,0 +1,178 @@
+"""`cpjax basin`: where controllers work, as maps, JSON and files of all runs."""
+
+import argparse
+import dataclasses
+import math
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cpjax import io
+from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, named_hybrid, resolve
+from cpjax.cli.progress import progress
+from cpjax.cli.tables import print_table
+from cpjax.controllers import Hybrid
+from cpjax.errors import InputError
+from cpjax.plant import CartPole
+from cpjax.sim.metrics import Metrics
+from cpjax.state import NAMES, UNITS
+from cpjax.study.basin import Axis, Map, area, document
+from cpjax.study.design_check import DesignCheck, check_design
+from cpjax.study.recording import record_sweep
+
+if TYPE_CHECKING:  # matplotlib takes a while; bad input should not wait for it
+    from cpjax.show.basin import Panel
+
+CONTROLLERS = ("corrected/lqr", "corrected/placement", "tuned_lqr", "tuned_place")
+_RANGES = {"x": (-2.0, 2.0), "x_dot": (-3.0, 3.0), "theta": (-math.pi, math.pi), "theta_dot": (-12.0, 12.0)}
+
+OPTIONS = [
+    Option("map", "across", "coordinate of the horizontal axis (default theta)", choices=NAMES),
+    Option("map", "up", "coordinate of the vertical axis (default theta_dot)", choices=NAMES),
+    Option("map", "cells", "along each axis (default 512)", int),
+    *(
+        Option(
+            "map",
+            name,
+            f"range of {name} [{unit}]: of its axis (default {low:.4g} {high:.4g}), or else what each start's is drawn "
+            "from (default 0 0)",
+            float,
+            count=2,
+        )
+        for (name, (low, high)), unit in zip(_RANGES.items(), UNITS, strict=True)
+    ),
+    Option(
+        "map",
+        "controllers",
+        "one map each: tuned_lqr, tuned_place, a file, or a law of the paper with its regulator, such as "
+        "as-printed/placement or corrected/lqr/computed (default " + " ".join(CONTROLLERS) + ")",
+        count="+",
+    ),
+    Option("run", "duration", "length of each run [s] (default 10)", float),
+    Option("run", "dt", "integration step and control period [s] (default 0.002)", float),
+    *PLANT_OPTIONS,
+]
+
+
+def add_command(commands: Any) -> None:
+    """Declares the command."""
+    text = (
+        "Runs controllers from every cell of a map over two coordinates of the start. Writes basin.png, basin.json and "
+        "the metrics of all runs. Sampled, not certified. An interrupted map goes on where it stopped."
+    )
+    parser = commands.add_parser("basin", help="where controllers work, as maps", description=text)
+    add_options(parser, OPTIONS, out="out/basin")
+    parser.set_defaults(run=run, many_starts=True)
+
+
+def run(given: argparse.Namespace) -> int:
+    """Runs the command."""
+    sections = resolve(given, OPTIONS)
+    plant = build_plant(sections["plant"])
+    chosen = dict(sections["map"])
+    names = chosen.pop("controllers", list(CONTROLLERS))
+    if len(set(names)) < len(names):
+        raise InputError("controllers", names, "each one once")
+    controllers = {name: named_hybrid(name, plant) for name in names}
+    chart = chart_of(chosen, given.seed)
+    setting = {"duration": 10.0, "dt": 0.002, **sections["run"]}
+    begin = time.perf_counter()
+    metrics = {name: mapped(given.out, plant, chart, name, controllers[name], setting) for name in names}
+    seconds = time.perf_counter() - begin
+
+    from cpjax.show.basin import basins
+    from cpjax.show.figures import save_figure
+
+    panels = [panel_of(plant, chart, name, controllers[name], metrics[name]) for name in names]
+    save_figure(given.out / "basin.png", basins(chart, panels))
+    rows = {name: document(chart, metrics[name]) for name in names}
+    io.write_json(
+        given.out / "basin.json",
+        {
+            "what": "share of a map from which controllers settle: sampled, not certified",
+            "versions": io.versions(),
+            "map": dataclasses.asdict(chart),
+            "run": setting,
+            "plant": io.encode(plant),
+            "controllers": {name: io.encode(controllers[name]) for name in names},
+            "basins": rows,
+            "files": {name: file_of(name) for name in names},
+            "seconds": seconds,
+        },
+    )
+    print_basins(rows)
+    steps = len(names) * chart.up.cells * chart.across.cells * round(setting["duration"] / setting["dt"])
+    print(f"{steps / 1e6:,.0f} M steps in {seconds:.1f} s, compilation and files included")
+    print(f"wrote {given.out / 'basin.json'}, basin.png and the runs of each map")
+    return 0
+
+
+def chart_of(chosen: dict[str, Any], seed: int) -> Map:
+    """The map that the options describe."""
+
+    def axis(name: str) -> Axis:
+        low, high = chosen.get(name) or _RANGES[name]
+        return Axis(name, low, high, chosen.get("cells", 512))
+
+    across, up = axis(chosen.get("across", "theta")), axis(chosen.get("up", "theta_dot"))
+    others = {name: tuple(chosen[name]) for name in NAMES if name in chosen and name not in (across.name, up.name)}
+    return Map(across, up, others, seed)
+
+
+def file_of(name: str) -> str:
+    """Of a controller's runs."""
+    return name.replace("/", "-").removesuffix(".json").removesuffix(".toml") + ".npz"
+
+
+def mapped(out: Any, plant: CartPole, chart: Map, name: str, controller: Hybrid, setting: dict[str, Any]) -> Metrics:
+    """The metrics of a controller's map, recorded in `out`."""
+    with progress(name) as report:
+        metrics: Metrics = record_sweep(
+            out / file_of(name),
+            plant,
+            controller,
+            chart.starts(),
+            **setting,
+            clock="sampled",
+            about={"across": chart.across.name, "up": chart.up.name, "cells": chart.across.cells, "seed": chart.seed},
+            progress=lambda done, total: report(done, total, "starts"),
+        )
+    return metrics
+
+
+def panel_of(plant: CartPole, chart: Map, name: str, controller: Hybrid, metrics: Metrics) -> "Panel":
+    """What the picture needs of one controller."""
+    from cpjax.show.basin import Panel
+
+    found = area(chart, np.asarray(metrics.success))
+    return Panel(name, controller, float(plant.motor.voltage_limit), _checked(plant, controller), metrics, found)
+
+
+def _checked(plant: CartPole, controller: Hybrid) -> DesignCheck | None:
+    regulator: Any = controller.regulator
+    try:
+        return check_design(plant, regulator, controller.gate)
+    except InputError:
+        return None
+
+
+def print_basins(rows: dict[str, dict[str, Any]]) -> None:
+    """The table for people."""
+
+    def text(value: float | None) -> str:
+        return "-" if value is None else f"{value:.3g}"
+
+    header = ("controller", "share [%]", "area", "95 % +-", "settling [s]", "its maximum [s]", "switches", "at most")
+    unit = next(iter(rows.values()))["area_unit"]
+    cells = [
+        (
+            name,
+            f"{100 * row['share']:.2f}",
+            f"{row['area']:.3f}",
+            f"{row['area_half_width']:.3f}",
+            *(text(row[k]) for k in ("settling_time_mean", "settling_time_max", "switches_mean", "switches_max")),
+        )
+        for name, row in rows.items()
+    ]
+    print_table(f"Basins of attraction, sampled [{unit}]", header, cells, text_columns=1)
