@@ -34,18 +34,20 @@ _OPTIONS = "xla_cpu_use_multi_output_fusion=true,xla_cpu_small_while_loop_byte_t
 _FLAG = "--xla_backend_extra_options"
 
 
-def configure_cpu(devices: int | None = None) -> bool:
+def configure_cpu(devices: int | None = None, *, gradients: bool = False) -> bool:
     """Makes simulations of many starts on a CPU fast. Call it before JAX computes anything, once.
 
-    It is for values. Gradients are slower after it, those through a trajectory much slower (docs/performance.md).
+    By default it is for values: gradients are slower after it, those through a trajectory much slower
+    (docs/performance.md).
 
     Args:
       devices: as how many devices the CPU is to appear, which `sweep` shares its starts out to; by default as many as
         there are cores that this process may use.
+      gradients: for a process that computes both. The cores become devices, and the compiler keeps its own options.
 
     Returns:
-      Whether the compiler's options were set: not with another jaxlib than the tested ones, nor where XLA_FLAGS has
-      options of this kind already.
+      Whether the compiler's options were set: not for gradients, with another jaxlib than the tested ones, or where
+      XLA_FLAGS has options of this kind already.
 
     Raises:
       InputError: `devices` below 1.
@@ -64,7 +66,7 @@ def configure_cpu(devices: int | None = None) -> bool:
     except RuntimeError as problem:
         message = "configure_cpu is too late: JAX has started. Call it before anything is computed with JAX"
         raise RuntimeError(message) from problem
-    if not is_tested() or _FLAG in flags:
+    if gradients or not is_tested() or _FLAG in flags:
         return False
     os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}={_OPTIONS}".strip()
     return True

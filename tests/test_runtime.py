@@ -37,6 +37,10 @@ def test_by_default_each_core_of_the_process_is_a_device():
     assert in_a_process()[1] == str(len(os.sched_getaffinity(0)))
 
 
+def test_for_gradients_cores_become_devices_and_the_compiler_keeps_its_options():
+    assert in_a_process("devices=2, gradients=True") == ["False", "2", "False"]
+
+
 def test_another_jaxlib_than_the_tested_ones_keeps_its_own_options():
     assert in_a_process("devices=2", before="runtime.TESTED = ('0.0.1',)") == ["False", "2", "False"]
 

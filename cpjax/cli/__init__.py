@@ -32,7 +32,20 @@ class _Parser(argparse.ArgumentParser):
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    from cpjax.cli import audit_gains, audit_gradients, basin, compare, design, report, reproduce, sweep, swingup, tune
+    from cpjax.cli import (
+        animate,
+        audit_gains,
+        audit_gradients,
+        basin,
+        compare,
+        design,
+        pareto,
+        report,
+        reproduce,
+        sweep,
+        swingup,
+        tune,
+    )
 
     parser = _Parser(
         prog="cpjax",
@@ -42,7 +55,20 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
-    for module in (swingup, sweep, design, reproduce, audit_gains, audit_gradients, tune, compare, basin, report):
+    for module in (
+        swingup,
+        sweep,
+        design,
+        reproduce,
+        audit_gains,
+        audit_gradients,
+        tune,
+        compare,
+        basin,
+        pareto,
+        animate,
+        report,
+    ):
         module.add_command(commands)
     return parser
 
@@ -56,8 +82,8 @@ def main(arguments: Sequence[str] | None = None, *, set_up: bool = False) -> int
     """Runs one command and returns its exit code; see `EXIT_CODES`.
 
     Args:
-      set_up: keep what is compiled for the next process, and set the compiler's options where the command simulates
-        many starts. Only before JAX has started.
+      set_up: keep what is compiled for the next process, and set up the CPU where the command simulates many starts.
+        Only before JAX has started.
     """
     parser = make_parser()
     try:

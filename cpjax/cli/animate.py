@@ -1,0 +1,115 @@
+"""`cpjax animate`: one run, or several side by side, as a moving picture."""
+
+import argparse
+from typing import Any
+
+import numpy as np
+
+from cpjax import io
+from cpjax.cli.options import (
+    PLANT_OPTIONS,
+    START_OPTIONS,
+    Option,
+    add_options,
+    build_plant,
+    build_start,
+    named_hybrid,
+    resolve,
+)
+from cpjax.cli.progress import progress
+from cpjax.controllers import Hybrid, PoleFactors
+from cpjax.errors import InputError
+from cpjax.sim.rollout import rollout
+
+CONTROLLERS = ("corrected/lqr", "tuned_lqr")
+_FORMATS = ("gif", "mp4", "html")
+
+OPTIONS = [
+    Option(
+        "animation",
+        "controllers",
+        "side by side: tuned_lqr, tuned_place, a file, or a law of the paper with its regulator, such as "
+        "as-printed/placement (default " + " ".join(CONTROLLERS) + ")",
+        count="+",
+    ),
+    Option("animation", "format", "(default gif; mp4 needs ffmpeg, and is html without it)", choices=_FORMATS),
+    Option("animation", "duration", "shown [s] (default 6)", float),
+    Option("animation", "rate", "pictures per second (default 20)", float),
+    *START_OPTIONS,
+    *PLANT_OPTIONS,
+]
+
+
+def add_command(commands: Any) -> None:
+    """Declares the command."""
+    text = (
+        "Shows controllers swinging the pendulum up from one start, in real time: cart, pole, trail, voltage and mode. "
+        "Writes animation.gif (.mp4, .html) and animation.json."
+    )
+    parser = commands.add_parser("animate", help="runs as a moving picture", description=text)
+    add_options(parser, OPTIONS, out="out/animate")
+    parser.set_defaults(run=run)
+
+
+def run(given: argparse.Namespace) -> int:
+    """Runs the command."""
+    sections = resolve(given, OPTIONS)
+    plant = build_plant(sections["plant"])
+    chosen = {"controllers": list(CONTROLLERS), "format": "gif", "duration": 6.0, "rate": 20.0, **sections["animation"]}
+    if not 0.0 < chosen["duration"] <= 600.0:
+        raise InputError("duration", chosen["duration"], "above 0 and at most 600 s")
+    controllers = {name: named_hybrid(name, plant) for name in chosen["controllers"]}
+    start = build_start(sections["start"], given.seed)
+    dt = 0.002
+    duration = dt * round(chosen["duration"] / dt)
+    runs = {
+        name: rollout(plant, controller, start, duration=duration, dt=dt, clock="sampled")
+        for name, controller in controllers.items()
+    }
+
+    from cpjax.show.animation import Scene, encoder, save_animation
+
+    length = 2.0 * float(plant.pole_length) if float(plant.pole_inertia) > 0.0 else float(plant.pole_length)
+    limit = float(plant.motor.voltage_limit)
+    scenes = [Scene(name, _colour(name, controllers[name]), one, length, limit) for name, one in runs.items()]
+    kind = chosen["format"]
+    if kind == "mp4" and encoder() is None:
+        kind = "html"
+        print("no ffmpeg: writing a page of HTML instead of an MP4")
+    path = given.out / f"animation.{kind}"
+    with progress("animate") as report:
+        save_animation(path, scenes, duration=duration, rate=chosen["rate"], report=report)
+    document = {
+        "what": "runs shown by the animation beside this file",
+        "versions": io.versions(),
+        "seed": given.seed,
+        "start": io.encode(start),
+        "plant": io.encode(plant),
+        "file": path.name,
+        "duration": duration,
+        "rate": chosen["rate"],
+        "runs": {
+            name: {
+                "controller": io.encode(controllers[name]),
+                "settling_time": float(one.metrics.settling_time),
+                "cart_travel": float(one.metrics.cart_travel),
+                "effort": float(one.metrics.effort),
+                "switches": int(one.metrics.switches),
+            }
+            for name, one in runs.items()
+        },
+    }
+    io.write_json(given.out / "animation.json", document)
+    for name, one in runs.items():
+        time = float(one.metrics.settling_time)
+        print(f"{name}: " + (f"settles after {time:.2f} s" if np.isfinite(time) else "does not settle in this time"))
+    print(f"wrote {path} and animation.json")
+    return 0
+
+
+def _colour(name: str, controller: Hybrid) -> str:
+    """Its design's; a gain without one is known by its name."""
+    from cpjax.show.figures import DESIGN_COLOURS
+
+    placed = isinstance(getattr(controller.regulator, "design", None), PoleFactors) or "/placement" in name
+    return DESIGN_COLOURS["placement" if placed else "lqr"]

@@ -1,0 +1,106 @@
+"""Trade-off fronts."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES
+
+COST_LABELS = {
+    "effort": "effort [V$^2$ s]",
+    "cart_travel": "cart travel [m]",
+    "voltage_variation": "variation of the voltage [V]",
+}
+_GREY = "#777777"
+
+
+class Curve(NamedTuple):
+    """A design's front, and what random search found for the same cost."""
+
+    traced: np.ndarray[Any, Any]
+    """Settling times and costs (n, 2)."""
+    random: np.ndarray[Any, Any]
+    traced_volume: float
+    random_volume: float
+
+
+class Known(NamedTuple):
+    """A controller to show as a point."""
+
+    label: str
+    design: str
+    time: float
+    cost: float
+    success: float
+
+
+def fronts(
+    curves: Mapping[str, Mapping[str, Curve]],
+    bland: Mapping[str, Mapping[str, np.ndarray[Any, Any]]],
+    known: Mapping[str, Sequence[Known]],
+) -> Figure:
+    """One panel for each cost: `curves[cost][design]`, the bland starts, and known controllers as hollow points."""
+    figure = Figure(figsize=(5.2 * len(curves), 5.6), layout="constrained")
+    panels = figure.subplots(1, len(curves), squeeze=False)[0]
+    for axes, (cost, designs) in zip(panels, curves.items(), strict=True):
+        for design, curve in designs.items():
+            _draw(axes, design, curve)
+        for design, point in bland[cost].items():
+            axes.plot(*point, "*", color=DESIGN_COLOURS[design], markersize=11, label=f"{DESIGN_NAMES[design]}, bland")
+        for one in known[cost]:
+            marker = "s" if one.design == "lqr" else "o"
+            axes.plot(one.time, one.cost, marker, color=DESIGN_COLOURS[one.design], markerfacecolor="none")
+            axes.annotate(
+                f"{one.label}\n({100 * one.success:.0f} % settle)",
+                (one.time, one.cost),
+                textcoords="offset points",
+                xytext=(6, 4),
+                fontsize="x-small",
+                color=_GREY,
+            )
+        axes.set_yscale("log")
+        axes.set_xscale("log")
+        axes.set_xlabel("mean settling time [s]")
+        axes.set_ylabel("mean " + COST_LABELS[cost])
+        axes.grid(alpha=0.3, which="both")
+        axes.legend(frameon=False, fontsize="small")
+        axes.set_title(_verdict(designs), fontsize="medium")
+    return figure
+
+
+def by_supply(curves: Mapping[float, Mapping[str, Curve]]) -> Figure:
+    """Settling time against effort, a panel for each supply."""
+    figure = Figure(figsize=(4.2 * len(curves), 4.6), layout="constrained")
+    panels = figure.subplots(1, len(curves), squeeze=False, sharex=True, sharey=True)[0]
+    for axes, (supply, designs) in zip(panels, sorted(curves.items()), strict=True):
+        for design, curve in designs.items():
+            _draw(axes, design, curve)
+        axes.set_yscale("log")
+        axes.set_xscale("log")
+        axes.set_title(f"{supply:g} V: {_verdict(designs)}", fontsize="medium")
+        axes.set_xlabel("mean settling time [s]")
+        axes.grid(alpha=0.3, which="both")
+    panels[0].set_ylabel("mean " + COST_LABELS["effort"])
+    panels[0].legend(frameon=False, fontsize="small")
+    return figure
+
+
+def _draw(axes: Axes, design: str, curve: Curve) -> None:
+    colour, name = DESIGN_COLOURS[design], DESIGN_NAMES[design]
+    marker = "s" if design == "lqr" else "o"
+    axes.step(*curve.traced.T, where="post", color=colour, linewidth=1.2)
+    axes.plot(*curve.traced.T, marker, color=colour, markersize=4, label=f"{name}, by gradients")
+    axes.step(*curve.random.T, where="post", color=colour, linewidth=0.9, linestyle="--", alpha=0.7)
+    axes.plot(*curve.random.T, "x", color=colour, markersize=4, alpha=0.7, label=f"{name}, random search")
+
+
+def _verdict(designs: Mapping[str, Curve]) -> str:
+    return "random search: " + ", ".join(
+        f"{100 * (curve.random_volume / curve.traced_volume - 1.0):+.1f} % of the {DESIGN_NAMES[design]} area"
+        if curve.traced_volume
+        else "-"
+        for design, curve in designs.items()
+    )
