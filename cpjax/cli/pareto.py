@@ -19,9 +19,9 @@ from cpjax.study.reproduction import DESIGNS, Setting
 
 SUPPLIES = (6.0, 9.0, 24.0)
 _PLANNED = {
-    "weights": ("tunings for each cost and supply", int, 24),
+    "bounds": ("tunings for each cost and supply", int, 24),
     "candidates": ("random controllers to begin with", int, 2048),
-    "steps": ("of the optimiser", int, 80),
+    "steps": ("of the optimiser", int, 60),
     "batch": ("starts of a step", int, 8),
     "final": ("starts that the points are measured from", int, 1024),
 }
@@ -66,7 +66,7 @@ def run(given: argparse.Namespace) -> int:
             raise InputError("supplies", supply, "finite numbers above 0 [V]")
     plan = FrontPlan(seed=given.seed, **chosen)
     found = {design: traced(given.out, plant, design, plan, supplies) for design in DESIGNS}
-    compared = compare(plant, entries(plant), Setting(count=plan.final, seed=given.seed, duration=plan.horizon))[1]
+    compared = compare(plant, entries(plant), Setting(count=plan.final, seed=given.seed))[1]
     document = {
         "what": "mean settling time against mean cost, of controllers that no other found beats",
         "versions": io.versions(),

@@ -51,23 +51,20 @@ def fronts(
         for design, point in bland[cost].items():
             axes.plot(*point, "*", color=DESIGN_COLOURS[design], markersize=11, label=f"{DESIGN_NAMES[design]}, bland")
         for one in known[cost]:
-            marker = "s" if one.design == "lqr" else "o"
-            axes.plot(one.time, one.cost, marker, color=DESIGN_COLOURS[one.design], markerfacecolor="none")
-            axes.annotate(
-                f"{one.label}\n({100 * one.success:.0f} % settle)",
-                (one.time, one.cost),
-                textcoords="offset points",
-                xytext=(6, 4),
-                fontsize="x-small",
-                color=_GREY,
-            )
-        axes.set_yscale("log")
-        axes.set_xscale("log")
+            label = f"{DESIGN_NAMES[one.design]}, {one.label} ({100 * one.success:.0f} % settle)"
+            marker = ("s" if one.design == "lqr" else "o") if one.label == "tuned" else "Xv"[one.label.endswith("ed")]
+            colour = DESIGN_COLOURS[one.design]
+            axes.plot(one.time, one.cost, marker, color=colour, markerfacecolor="none", markersize=9, label=label)
         axes.set_xlabel("mean settling time [s]")
         axes.set_ylabel("mean " + COST_LABELS[cost])
         axes.grid(alpha=0.3, which="both")
-        axes.legend(frameon=False, fontsize="small")
         axes.set_title(_verdict(designs), fontsize="medium")
+    handles = {
+        label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize="small"
+    )
     return figure
 
 
@@ -78,9 +75,7 @@ def by_supply(curves: Mapping[float, Mapping[str, Curve]]) -> Figure:
     for axes, (supply, designs) in zip(panels, sorted(curves.items()), strict=True):
         for design, curve in designs.items():
             _draw(axes, design, curve)
-        axes.set_yscale("log")
-        axes.set_xscale("log")
-        axes.set_title(f"{supply:g} V: {_verdict(designs)}", fontsize="medium")
+        axes.set_title(f"{supply:g} V\n{_verdict(designs)}", fontsize="medium")
         axes.set_xlabel("mean settling time [s]")
         axes.grid(alpha=0.3, which="both")
     panels[0].set_ylabel("mean " + COST_LABELS["effort"])
@@ -98,9 +93,9 @@ def _draw(axes: Axes, design: str, curve: Curve) -> None:
 
 
 def _verdict(designs: Mapping[str, Curve]) -> str:
-    return "random search: " + ", ".join(
-        f"{100 * (curve.random_volume / curve.traced_volume - 1.0):+.1f} % of the {DESIGN_NAMES[design]} area"
-        if curve.traced_volume
-        else "-"
-        for design, curve in designs.items()
-    )
+    """How much smaller the area is that the random search dominates."""
+    parts = []
+    for design, curve in designs.items():
+        if curve.traced_volume:
+            parts.append(f"{DESIGN_NAMES[design]} {100 * (curve.random_volume / curve.traced_volume - 1.0):+.0f} %")
+    return "hypervolume of random search: " + ("\n" + ", ".join(parts) if parts else "both 0")

@@ -1,13 +1,15 @@
 """What settling faster costs: trade-off fronts of a design, traced by gradients, and by random search for comparison.
 
 Every point is a hybrid controller. Random candidates, judged by values, are where the search begins. Then many tunings
-go side by side under one `vmap`: each minimises the time outside the target plus a weight times one cost, for a ladder
-of weights, every cost, and every supply. All controllers met on the way are judged by the protocol's metrics; those
-that no other beats are the front. The random search draws candidates until it has simulated as many Runge-Kutta steps,
-a gradient's counted as the measured multiple of a value's.
+go side by side under one `vmap`: each minimises the time outside the target while one cost stays below a bound, for a
+ladder of bounds, every cost, and every supply (epsilon constraints, Haimes and others, 1971). Now and then all are
+judged by the protocol's metrics, and each goes on from the fastest controller met so far that keeps to its bound. Of
+all that were judged, those that no other beats are the front. The random search draws candidates until it has simulated
+as many Runge-Kutta steps, a gradient's counted as the measured multiple of a value's.
 """
 
 import dataclasses
+import functools
 import math
 import operator
 from collections.abc import Callable
@@ -31,7 +33,7 @@ from cpjax.sim.rollout import measure
 from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
 from cpjax.state import State
-from cpjax.tune.objective import Effort, Jerkiness, Unfinished, WeightedSum
+from cpjax.tune.objective import Effort, Jerkiness, Unfinished
 from cpjax.tune.parameters import FreeParameters, free_parameters
 from cpjax.tune.starting import beginning
 
@@ -57,9 +59,10 @@ class FrontPlan:
 
     Attributes:
       seed: of everything random. Starts are never those that a seed names for `cpjax.sample_starts`.
-      weights: of the ladder, for each cost and supply.
-      lowest: the ladder's first weight, in settling times per cost of the bland start; they rise geometrically.
-      highest: its last.
+      bounds: of the ladder, for each cost and supply; from `lowest` times the least cost among the candidates
+        geometrically to the cost of the fastest.
+      lowest: see there.
+      penalty: what a cost of twice its bound counts [s].
       candidates: random controllers to begin with.
       screening: starts by which they are judged.
       steps: of the optimiser.
@@ -69,7 +72,7 @@ class FrontPlan:
       dt: their step [s].
       spare_rate: steps beyond those in each second, for crossings [1/s].
       width: of the target [rad and m].
-      judge_every: steps after which all controllers are judged.
+      judge_every: steps after which all controllers are judged, and exchanged.
       judging: starts by which they are.
       final: starts that the points of a front are measured from.
       horizon: of judging and of the last measurement [s].
@@ -78,22 +81,22 @@ class FrontPlan:
     """
 
     seed: int = 1
-    weights: int = 24
-    lowest: float = 0.02
-    highest: float = 20.0
+    bounds: int = 24
+    lowest: float = 0.85
+    penalty: float = 10.0
     candidates: int = 2048
     screening: int = 16
-    steps: int = 80
+    steps: int = 60
     batch: int = 8
     learning_rate: float = 0.04
-    duration: float = 5.0
+    duration: float = 8.0
     dt: float = 0.02
     spare_rate: float = 20.0
     width: float = 0.05
-    judge_every: int = 8
+    judge_every: int = 6
     judging: int = 64
     final: int = 1024
-    horizon: float = 10.0
+    horizon: float = 20.0
     horizon_dt: float = 0.002
     success: float = 0.99
 
@@ -106,14 +109,10 @@ class FrontPlan:
                     raise InputError(field.name, value, f"a whole number, at least {least}")
             elif isinstance(value, (bool, str)) or not 0.0 < value < math.inf:
                 raise InputError(field.name, value, "a finite number above 0")
-        if not self.lowest < self.highest:
-            raise InputError("highest", self.highest, f"above lowest, {self.lowest}")
+        if self.lowest >= 1.0:
+            raise InputError("lowest", self.lowest, "above 0 and below 1")
         if self.success > 1.0:
             raise InputError("success", self.success, "above 0 and at most 1")
-
-    def ladder(self) -> Numbers:
-        """The weights (weights,), in settling times per cost of the bland start."""
-        return np.geomspace(self.lowest, self.highest, self.weights)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,7 +139,8 @@ class Fronts:
     Attributes:
       traced: by gradients: (supply [V], cost) to front.
       random: by random search, likewise.
-      bland: (supply, cost) to the bland start's settling time and cost (2,).
+      bland: (supply, cost) to the bland start's settling time and cost (2,), at the plant's own supply where it settles
+        from no start; 1.1 times as much is the hypervolumes' reference.
       steps: Runge-Kutta steps of values and of gradients that the tracing took, and the values of the random search.
     """
 
@@ -164,11 +164,32 @@ class Travel:
         return memory
 
 
+@pytree
+class BoundedTime:
+    """The time outside the target [s], and `penalty` times what each cost exceeds its bound by, relative to it."""
+
+    terms: tuple[Any, ...]
+    """The time, the costs, and the time that a stopped run left undone."""
+    bounds: tuple[Any, ...]
+    penalty: Any
+
+    def init(self, sample: Sample) -> tuple[Any, ...]:
+        return tuple(term.init(sample) for term in self.terms)
+
+    def update(self, memory: tuple[Any, ...], sample: Sample) -> tuple[Any, ...]:
+        return tuple(term.update(m, sample) for term, m in zip(self.terms, memory, strict=True))
+
+    def finish(self, memory: tuple[Any, ...], last: Sample) -> jax.Array:
+        time, *costs, undone = (term.finish(m, last) for term, m in zip(self.terms, memory, strict=True))
+        excess = sum(jnp.maximum(cost / bound - 1.0, 0.0) for cost, bound in zip(costs, self.bounds, strict=True))
+        return time + undone * (1.0 + self.penalty) + self.penalty * excess
+
+
 class _Lanes(NamedTuple):
     """What one tuning of many minimises, and on what."""
 
-    weights: jax.Array
-    """Of each of `COSTS` [s per unit]."""
+    bounds: jax.Array
+    """Of each of `COSTS`; infinite for all but one."""
     supply: jax.Array
     """[V]."""
 
@@ -187,7 +208,7 @@ class _Tracer:
     """One design's search."""
 
     def __init__(self, plant: CartPole, design: paper.Design, plan: FrontPlan) -> None:
-        self.plant, self.plan = plant, plan
+        self.plant, self.design, self.plan = plant, design, plan
         self.free = free_parameters(beginning("bland", design, plant))
         self.optimiser = optax.adam(optax.cosine_decay_schedule(plan.learning_rate, max(1, plan.steps), 0.1))
         self.spare = math.ceil(plan.spare_rate * plan.duration)
@@ -205,10 +226,11 @@ class _Tracer:
         """The plant at a supply [V]."""
         return dataclasses.replace(self.plant, motor=dataclasses.replace(self.plant.motor, voltage_limit=supply))
 
-    def draw(self, count: int, purpose: int) -> Numbers:
-        """Random candidates (count, d)."""
+    def draw(self, supply: float, count: int, purpose: int) -> Numbers:
+        """Random candidates (count, d), from ranges that suit the supply."""
         random = np.random.default_rng([self.plan.seed, _CANDIDATES, purpose])
-        return self.free.draw(random, count).astype(self.free.start().dtype)
+        free = free_parameters(beginning("bland", self.design, self.supplied(supply)))
+        return free.draw(random, count).astype(self.free.start().dtype)
 
     def judge(self, vectors: Numbers, supply: float, count: int, purpose: int) -> _Judged:
         """Controllers (n, d) by the protocol's metrics from so many starts, all the same."""
@@ -259,46 +281,51 @@ class _Tracer:
         kept = nondominated(points)
         return Front(points[kept], final.success[kept], final.vectors[kept], hypervolume(points, reference))
 
-    def trace(self, begun: dict[float, _Judged], lanes: list[tuple[float, str]], scales: Any, report: Report) -> Any:
+    def trace(self, begun: dict[float, _Judged], fronts: list[tuple[float, str]], report: Report) -> Any:
         """All controllers met, by supply: what `begun` has, and all that were judged on the way."""
         plan = self.plan
-        ladder = plan.ladder()
-        jobs = [(supply, cost, weight * scales[supply, cost]) for supply, cost in lanes for weight in ladder]
+        jobs = [(supply, cost, bound) for supply, cost in fronts for bound in _ladder(begun[supply], cost, plan)]
         # Every device has as many tunings: the last is done more than once if need be.
         jobs += [jobs[-1]] * (-len(jobs) % len(jax.devices()))
-        weights = np.zeros((len(jobs), len(COSTS)))
-        for row, (_, cost, weight) in enumerate(jobs):
-            weights[row, COSTS.index(cost)] = weight
+        bounds = np.full((len(jobs), len(COSTS)), np.inf)
+        for row, (_, cost, bound) in enumerate(jobs):
+            bounds[row, COSTS.index(cost)] = bound
         supplies = np.array([supply for supply, _, _ in jobs])
-        vectors = jnp.asarray(np.stack([_best(begun[supply], cost, weight) for supply, cost, weight in jobs]))
-        arguments = _Lanes(jnp.asarray(weights, vectors.dtype), jnp.asarray(supplies, vectors.dtype))
+        vectors = jnp.asarray(np.stack([_fastest(begun[supply], cost, bound)[0] for supply, cost, bound in jobs]))
+        lanes = _Lanes(jnp.asarray(bounds, vectors.dtype), jnp.asarray(supplies, vectors.dtype))
         state = self.optimiser.init(vectors)
-        met = {supply: [judged] for supply, judged in begun.items()}
+        met = dict(begun)
         for step in range(plan.steps):
-            starts = _starts(plan, plan.batch, _BATCH, step)
-            slope = self.gradient(vectors, arguments, starts)
+            slope = self.gradient(vectors, lanes, _starts(plan, plan.batch, _BATCH, step))
             with jax.numpy_dtype_promotion("standard"):  # optax's own arithmetic mixes dtypes
                 change, state = self.optimiser.update(slope, state)
                 moved = optax.apply_updates(vectors, change)
             vectors = jnp.where(jnp.isfinite(moved), moved, vectors)
             if (step + 1) % plan.judge_every == 0 or step + 1 == plan.steps:
+                times = np.full(len(jobs), np.inf)
                 for supply in met:
-                    met[supply].append(
-                        self.judge(np.asarray(vectors)[supplies == supply], supply, plan.judging, _JUDGE)
-                    )
+                    rows = np.flatnonzero(supplies == supply)
+                    judged = self.judge(np.asarray(vectors)[rows], supply, plan.judging, _JUDGE)
+                    met[supply] = _together([met[supply], judged])
+                    kept = (judged.success == 1.0) & np.all(judged.costs <= bounds[rows], axis=1)
+                    times[rows] = np.where(kept, judged.time, np.inf)
+                better = [_fastest(met[supply], cost, bound) for supply, cost, bound in jobs]
+                jump = np.array([time < 0.98 * now for (_, time), now in zip(better, times, strict=True)])
+                vectors = jnp.where(jump[:, None], np.stack([vector for vector, _ in better]), vectors)
+                state = jax.tree.map(functools.partial(_forgotten, rows=jump), state)
             report(step + 1, plan.steps, f"{len(jobs)} tunings side by side")
-        return {supply: _together(found) for supply, found in met.items()}
+        return met
 
     def gradient_steps(self, lanes: int) -> int:
         """Runge-Kutta steps of all gradients."""
         plan = self.plan
-        return plan.steps * lanes * plan.weights * plan.batch * (round(plan.duration / plan.dt) + self.spare)
+        return plan.steps * lanes * plan.bounds * plan.batch * (round(plan.duration / plan.dt) + self.spare)
 
     def begin(self, supply: float, count: int, purpose: int) -> _Judged:
         """The bland start and random candidates; the better ones of each front judged on more starts."""
-        drawn = np.concatenate([np.asarray(self.free.start())[None], self.draw(count, purpose)])
+        drawn = np.concatenate([np.asarray(self.free.start())[None], self.draw(supply, count, purpose)])
         screened = self.judge(drawn, supply, self.plan.screening, _SCREEN)
-        better = _layers(screened, 4 * self.plan.weights)
+        better = _layers(screened, 4 * self.plan.bounds)
         return self.judge(screened.vectors[better], supply, self.plan.judging, _JUDGE)
 
     def _build(self, vector: jax.Array, supply: jax.Array) -> Hybrid:
@@ -325,8 +352,7 @@ class _Tracer:
         plan, plant = self.plan, self.supplied(lane.supply)
         free = self._supplied(lane.supply)
         terms = (TimeOutside(plan.width, plan.width), Effort(), Travel(), Jerkiness(), Unfinished(plan.duration))
-        worst = 1.0 + lane.weights[0] * lane.supply * lane.supply
-        fold = WeightedSum(terms, (1.0, lane.weights[0], lane.weights[1], lane.weights[2], worst))
+        fold = BoundedTime(terms, tuple(lane.bounds), plan.penalty)
 
         def objective(vector: jax.Array, start: State) -> jax.Array:
             value: jax.Array = measure(
@@ -363,19 +389,17 @@ def trace_fronts(
         raise InputError("plant.motor.voltage_limit", own, "a finite number: effort is measured by it")
     tracer = _Tracer(plant, design, plan)
     others = [supply for supply in dict.fromkeys(map(float, supplies)) if supply != own]
-    lanes = [(own, cost) for cost in COSTS] + [(supply, "effort") for supply in others]
-    bland, scales = {}, {}
-    for supply in (own, *others):
+    wanted = [(own, cost) for cost in COSTS] + [(supply, "effort") for supply in others]
+    bland: dict[tuple[float, str], Numbers] = {}
+    for supply, cost in wanted:
         judged = tracer.bland(supply)
-        for cost in (cost for at, cost in lanes if at == supply):
-            point = np.array([judged.time[0], judged.costs[0, COSTS.index(cost)]])
-            bland[supply, cost] = point
-            scales[supply, cost] = point[0] / point[1] if np.all(np.isfinite(point)) else 1.0
+        point = np.array([judged.time[0], judged.costs[0, COSTS.index(cost)]])
+        bland[supply, cost] = point if np.all(np.isfinite(point)) else bland[own, cost]  # it never settles
     report(0, plan.steps, "screening candidates")
     tracer.value_steps = 0
     begun = {supply: tracer.begin(supply, plan.candidates, 0) for supply in (own, *others)}
-    met = tracer.trace(begun, lanes, scales, report)
-    values, gradients = tracer.value_steps, tracer.gradient_steps(len(lanes))
+    met = tracer.trace(begun, wanted, report)
+    values, gradients = tracer.value_steps, tracer.gradient_steps(len(wanted))
     report(plan.steps, plan.steps, "random search of the same cost")
     share = (values + GRADIENT_STEP * gradients) / (1 + len(others))
     each = plan.screening * round(plan.horizon / plan.horizon_dt)
@@ -384,7 +408,7 @@ def trace_fronts(
     searched = tracer.value_steps
 
     def fronts(found: dict[float, _Judged]) -> dict[tuple[float, str], Front]:
-        return {lane: tracer.front(found[lane[0]], *lane, 1.1 * bland[lane]) for lane in lanes}
+        return {lane: tracer.front(found[lane[0]], *lane, 1.1 * bland[lane]) for lane in wanted}
 
     steps = {"values": values, "gradients": gradients, "random": searched}
     return Fronts(fronts(met), fronts(drawn), bland, steps)
@@ -396,12 +420,32 @@ def _starts(plan: FrontPlan, count: int, purpose: int, step: int = 0) -> State:
     return sample_starts("hanging", count, seed=seed, dtype=np.dtype(jnp.result_type(float)))
 
 
-def _best(judged: _Judged, cost: str, weight: float) -> Numbers:
-    """The controller with the least weighted sum, of those that never fail if there are any."""
-    score = judged.time + weight * judged.costs[:, COSTS.index(cost)]
-    score = np.where(judged.success >= np.max(judged.success), score, np.inf)
-    found: Numbers = judged.vectors[int(np.argmin(score))]
-    return found
+def _ladder(judged: _Judged, cost: str, plan: FrontPlan) -> Numbers:
+    """Bounds of a cost (bounds,)."""
+    column = judged.costs[:, COSTS.index(cost)]
+    good = (judged.success == np.max(judged.success)) & np.isfinite(judged.time)
+    if not np.any(good):
+        return np.full(plan.bounds, np.inf)
+    fastest = column[good][np.argmin(judged.time[good])]
+    return np.geomspace(plan.lowest * np.min(column[good]), fastest, plan.bounds)
+
+
+def _fastest(judged: _Judged, cost: str, bound: float) -> tuple[Numbers, float]:
+    """The fastest controller that keeps to the bound, and its time; if there is none, the cheapest, and infinity. Of
+    those that never fail, or fail least.
+    """
+    column = judged.costs[:, COSTS.index(cost)]
+    good = judged.success == np.max(judged.success)
+    kept = good & (column <= bound) & np.isfinite(judged.time)
+    if np.any(kept):
+        best = int(np.argmin(np.where(kept, judged.time, np.inf)))
+        return judged.vectors[best], float(judged.time[best])
+    return judged.vectors[int(np.argmin(np.where(good, column, np.inf)))], math.inf
+
+
+def _forgotten(leaf: jax.Array, rows: Numbers) -> jax.Array:
+    """An optimiser's memory without that of some rows."""
+    return jnp.where(rows[:, None], 0.0, leaf).astype(leaf.dtype) if leaf.ndim == 2 else leaf
 
 
 def _layers(judged: _Judged, least: int) -> Numbers:

@@ -31,7 +31,13 @@ def everything(a, b, symmetric):
 
 
 @pytest.mark.parametrize(
-    ("n", "dtype"), [*((n, np.float64) for n in (1, 2, 3, 4, 5, 6, 8, 11, 16)), (4, np.float32), (16, np.float32)]
+    ("n", "dtype"),
+    [
+        *((n, np.float64) for n in (1, 2, 4, 8)),
+        (4, np.float32),
+        *(pytest.param(n, np.float64, marks=pytest.mark.slow) for n in (3, 5, 6, 11, 16)),
+        pytest.param(16, np.float32, marks=pytest.mark.slow),
+    ],
 )
 def test_a_batch_is_solved_and_judged_as_numpy_does(n, dtype):
     rng = np.random.default_rng(5)

@@ -74,8 +74,7 @@ def test_without_clip_and_crossing_it_is_the_rollout_that_reads_its_mode_per_ste
     "gate",
     [
         "angle with hysteresis",
-        "level set",
-        *(pytest.param(g, marks=pytest.mark.slow) for g in ("angle", "angle and rate")),
+        *(pytest.param(g, marks=pytest.mark.slow) for g in ("level set", "angle", "angle and rate")),
     ],
 )
 def test_samples_are_on_the_grid_inside_the_supply_and_in_the_mode_that_the_gate_gives(gate):

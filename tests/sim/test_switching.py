@@ -97,7 +97,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", ["ball", "oscillator", *(pytest.param(c, marks=pytest.mark.slow) for c in CASES if " " in c)]
+)
 def test_values_and_derivatives_through_events_are_those_of_the_closed_form(case):
     ours, exact, x = CASES[case]
     x = jnp.asarray(x)

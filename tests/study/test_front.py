@@ -1,0 +1,73 @@
+"""Trade-off fronts: what is minimised, what is chosen, and a small front from end to end."""
+
+import math
+
+import numpy as np
+import pytest
+
+import cpjax
+from cpjax import paper
+from cpjax.errors import InputError
+from cpjax.numeric.pareto import nondominated
+from cpjax.sim.metrics import TimeOutside
+from cpjax.study.front import COSTS, BoundedTime, FrontPlan, Travel, _fastest, _Judged, _layers, trace_fronts
+from cpjax.tune.objective import Effort, Jerkiness, Unfinished
+from cpjax.tune.starting import beginning
+
+PLANT = paper.appendix_plant()
+START = cpjax.State(0.05, 0.0, 3.0, 0.1)
+
+
+def test_what_exceeds_its_bound_counts_relative_to_it():
+    law = beginning("bland", "lqr", PLANT)
+    run = {"duration": 2.0, "dt": 0.005, "clock": "sampled"}
+    protocol = cpjax.measure(PLANT, law, START, **run)
+    time = cpjax.measure(PLANT, law, START, metrics=TimeOutside(0.05, 0.05), **run)
+    terms = (TimeOutside(0.05, 0.05), Effort(), Travel(), Jerkiness(1e-9), Unfinished(2.0))
+    bounds = (0.5 * protocol.effort, 2.0 * protocol.cart_travel, math.inf)
+    found = cpjax.measure(PLANT, law, START, metrics=BoundedTime(terms, bounds, 10.0), **run)
+    assert float(found) == pytest.approx(float(time) + 10.0)  # effort is twice its bound, the others within theirs
+
+
+def judged(rows):
+    success, time, effort = np.array(rows).T
+    costs = np.stack([effort, np.ones(len(rows)), np.ones(len(rows))], axis=1)
+    return _Judged(np.arange(len(rows), dtype=float)[:, None], success, time, costs)
+
+
+def test_the_fastest_within_a_bound_never_fails_if_any_does_not():
+    met = judged([(1.0, 3.0, 10.0), (1.0, 2.0, 20.0), (0.9, 1.0, 5.0), (1.0, 4.0, 8.0)])
+    assert _fastest(met, "effort", 15.0)[0] == 0.0
+    assert _fastest(met, "effort", 25.0) == (1.0, 2.0)
+    vector, time = _fastest(met, "effort", 7.0)
+    assert (vector, time) == (3.0, math.inf)  # none keeps to it: the cheapest of those that never fail
+
+
+def test_layers_begin_with_what_no_other_beats_and_leave_out_what_fails():
+    met = judged([(1.0, 9.0, 90.0), (1.0, 1.0, 5.0), (1.0, 2.0, 4.0), (1.0, 3.0, 6.0), (0.5, 0.1, 0.1)])
+    assert _layers(met, 2).tolist() == [0, 1, 2]  # 0 is the first controller
+    assert _layers(met, 3).tolist() == [0, 1, 2, 3]
+    assert 4 not in _layers(met, 100)
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [({"bounds": 0}, "bounds"), ({"dt": -1.0}, "dt"), ({"lowest": 1.0}, "lowest"), ({"success": 1.5}, "success")],
+)
+def test_a_bad_plan_is_refused(change, field):
+    with pytest.raises(InputError, match=field):
+        FrontPlan(**change)
+
+
+@pytest.mark.slow
+def test_a_small_front_is_made_of_controllers_that_do_what_its_points_say():
+    plan = FrontPlan(bounds=4, candidates=256, steps=6, judge_every=3, final=64, horizon=10.0, horizon_dt=0.004)
+    found = trace_fronts(PLANT, "placement", plan, report=lambda *_: None)
+    for cost in COSTS:
+        front = found.traced[12.0, cost]
+        assert len(front.points) >= 2
+        assert len(nondominated(front.points)) == len(front.points)
+        assert np.all(front.success >= plan.success)
+        assert np.all(front.points[0, 0] < found.bland[12.0, cost][0])
+        assert front.volume > 0.0
+    assert found.steps["random"] == pytest.approx(found.steps["values"] + 36.0 * found.steps["gradients"], rel=0.1)
