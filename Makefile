@@ -5,7 +5,7 @@ PYTHON ?= python3
 OUT ?= out
 BIN := .venv/bin
 
-.PHONY: report test test-slow check format build clean
+.PHONY: report test test-slow check format docs build clean
 
 report: .venv/ready  ## the main job: the paper's controllers, reproduced, as one HTML page
 	$(BIN)/cpjax report --out $(OUT)/report
@@ -24,6 +24,9 @@ check: .venv/ready-test
 format: .venv/ready-test  ## puts the code into the form that `make check` wants
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+docs: .venv/ready-test  ## the documentation as pages in build/site, strictly
+	$(BIN)/mkdocs build --strict
 
 build: .venv/ready-test  ## sdist and wheel in dist/
 	$(BIN)/python -m build --outdir dist

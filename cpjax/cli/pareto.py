@@ -19,9 +19,9 @@ from cpjax.study.reproduction import DESIGNS, Setting
 
 SUPPLIES = (6.0, 9.0, 24.0)
 _PLANNED = {
-    "bounds": ("tunings for each cost and supply", int, 24),
-    "candidates": ("random controllers to begin with", int, 2048),
-    "steps": ("of the optimiser", int, 60),
+    "bounds": ("tunings for each cost and supply", int, 31),
+    "candidates": ("random controllers to begin with", int, 4096),
+    "steps": ("of the optimiser", int, 100),
     "batch": ("starts of a step", int, 8),
     "final": ("starts that the points are measured from", int, 1024),
 }

@@ -60,7 +60,7 @@ class FrontPlan:
     Attributes:
       seed: of everything random. Starts are never those that a seed names for `cpjax.sample_starts`.
       bounds: of the ladder, for each cost and supply; from `lowest` times the least cost among the candidates
-        geometrically to the cost of the fastest.
+        geometrically to the cost of the fastest; and one more tuning without a bound.
       lowest: see there.
       penalty: what a cost of twice its bound counts [s].
       candidates: random controllers to begin with.
@@ -81,19 +81,19 @@ class FrontPlan:
     """
 
     seed: int = 1
-    bounds: int = 24
+    bounds: int = 31
     lowest: float = 0.85
     penalty: float = 10.0
-    candidates: int = 2048
+    candidates: int = 4096
     screening: int = 16
-    steps: int = 60
+    steps: int = 100
     batch: int = 8
     learning_rate: float = 0.04
     duration: float = 8.0
     dt: float = 0.02
     spare_rate: float = 20.0
     width: float = 0.05
-    judge_every: int = 6
+    judge_every: int = 10
     judging: int = 64
     final: int = 1024
     horizon: float = 20.0
@@ -319,7 +319,7 @@ class _Tracer:
     def gradient_steps(self, lanes: int) -> int:
         """Runge-Kutta steps of all gradients."""
         plan = self.plan
-        return plan.steps * lanes * plan.bounds * plan.batch * (round(plan.duration / plan.dt) + self.spare)
+        return plan.steps * lanes * (plan.bounds + 1) * plan.batch * (round(plan.duration / plan.dt) + self.spare)
 
     def begin(self, supply: float, count: int, purpose: int) -> _Judged:
         """The bland start and random candidates; the better ones of each front judged on more starts."""
@@ -421,13 +421,13 @@ def _starts(plan: FrontPlan, count: int, purpose: int, step: int = 0) -> State:
 
 
 def _ladder(judged: _Judged, cost: str, plan: FrontPlan) -> Numbers:
-    """Bounds of a cost (bounds,)."""
+    """Bounds of a cost (bounds + 1,)."""
     column = judged.costs[:, COSTS.index(cost)]
     good = (judged.success == np.max(judged.success)) & np.isfinite(judged.time)
     if not np.any(good):
-        return np.full(plan.bounds, np.inf)
+        return np.full(plan.bounds + 1, np.inf)
     fastest = column[good][np.argmin(judged.time[good])]
-    return np.geomspace(plan.lowest * np.min(column[good]), fastest, plan.bounds)
+    return np.append(np.geomspace(plan.lowest * np.min(column[good]), fastest, plan.bounds), np.inf)
 
 
 def _fastest(judged: _Judged, cost: str, bound: float) -> tuple[Numbers, float]:
