@@ -5,10 +5,13 @@ PYTHON ?= python3
 OUT ?= out
 BIN := .venv/bin
 
-.PHONY: report test test-slow check format docs build clean
+.PHONY: report report-full test test-slow check format docs build clean
 
 report: .venv/ready  ## the main job: the paper's controllers, reproduced, as one HTML page
 	$(BIN)/cpjax report --out $(OUT)/report
+
+report-full: .venv/ready  ## the same with finer maps and full fronts: some fifteen minutes
+	$(BIN)/cpjax report --count 10000 --cells 512 --fronts full --out $(OUT)/report
 
 test: check  ## linter, type checker, tests with warnings as errors
 	$(BIN)/python -m pytest -n 2 --dist worksteal

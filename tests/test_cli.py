@@ -33,6 +33,7 @@ from cpjax import (
     sample_starts,
 )
 from cpjax.cli import main
+from cpjax.cli.basin import CONTROLLERS, file_of
 from cpjax.cli.reproduce import print_rows
 from cpjax.cli.swingup import OPTIONS
 from cpjax.study import reproduction
@@ -759,7 +760,7 @@ def report(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", buffers.StringIO())
         patch.setattr(sys, "stderr", buffers.StringIO())
-        code = main(["report", "--out", str(folder), *EVALUATION])
+        code = main(["report", "--out", str(folder), *EVALUATION, "--cells", "8", "--fronts", "none"])
     text = (folder / "report.html").read_text(encoding="utf-8")
     return SimpleNamespace(folder=folder, code=code, text=text, page=Page(text))
 
@@ -767,6 +768,7 @@ def report(tmp_path_factory):
 def test_a_report_writes_its_page_beside_the_rows_and_pictures(report):
     assert report.code == 0
     data = {"reproduction.json", "designs.json", "audit_gains.json", "compare.json", "responses.png", "by_start.png"}
+    data |= {"basin.json", "basin.png", *(file_of(name) for name in CONTROLLERS)}
     assert {p.name for p in report.folder.iterdir()} == {"report.html", "audit_gains.png", *data, *FIGURES}
 
 
@@ -791,7 +793,7 @@ def test_a_report_is_one_valid_page_that_loads_nothing_from_elsewhere(report):
 
 def test_every_picture_of_a_report_is_inside_it_and_described(report):
     pictures = [attributes for tag, attributes in report.page.tags if tag == "img"]
-    assert len(pictures) == len(FIGURES) + 3  # the audit's, and the comparison's two
+    assert len(pictures) == len(FIGURES) + 4  # the audit's, the comparison's two, and the basins'
     for picture in pictures:
         assert picture["src"].startswith("data:image/png;base64,iVBOR")
         assert len(picture["alt"]) > 20
@@ -854,10 +856,18 @@ def test_the_comparison_in_a_report_is_that_of_its_json(report):
         assert cells[5] == f"{row['over_successes']['settling_time']['mean']:.2f}"
 
 
+def test_the_basins_in_a_report_are_those_of_its_json(report):
+    basins = document(report.folder, "basin.json")["basins"]
+    shown = [cells for cells in report.page.rows if cells and cells[0] in CONTROLLERS]
+    assert [cells[0] for cells in shown] == list(CONTROLLERS)
+    for cells in shown:
+        assert cells[1] == f"{100 * basins[cells[0]]['share']:.2f}"
+
+
 def test_a_report_names_its_setting_and_the_command_that_makes_it_again(report):
     text = "".join(report.page.words)
     assert "8 starts from the set hanging (seed 1), 12 s each, RK4 with a step of 10 ms" in text
-    assert "cpjax report --starts hanging --count 8 --seed 1 --duration 12 --dt 0.01" in text
+    assert "cpjax report --starts hanging --count 8 --seed 1 --duration 12 --dt 0.01 --cells 8 --fronts none" in text
 
 
 @pytest.mark.slow
@@ -865,7 +875,8 @@ def test_a_report_of_odd_numbers_gives_the_command_with_all_their_digits(command
     monkeypatch.setattr(reproduction, "evaluate", fake_evaluate)
     for section in ("_designs", "_forensics"):
         monkeypatch.setattr(cpjax.cli.report, section, lambda page, given: None)
-    command("report", "--out", tmp_path, "--count", "3", "--duration", "1.23456789", "--dt", "0.00123456789")
+    few = ("--count", "3", "--cells", "0", "--fronts", "none")
+    command("report", "--out", tmp_path, *few, "--duration", "1.23456789", "--dt", "0.00123456789")
     text = "".join(Page((tmp_path / "report.html").read_text(encoding="utf-8")).words)
     assert "--duration 1.23456789 --dt 0.00123456789" in text
 

@@ -4,6 +4,8 @@ import argparse
 import dataclasses
 import math
 import time
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -75,37 +77,44 @@ def run(given: argparse.Namespace) -> int:
     if len(set(names)) < len(names):
         raise InputError("controllers", names, "each one once")
     controllers = {name: named_hybrid(name, plant) for name in names}
-    chart = chart_of(chosen, given.seed)
     setting = {"duration": 10.0, "dt": 0.002, **sections["run"]}
     begin = time.perf_counter()
-    metrics = {name: mapped(given.out, plant, chart, name, controllers[name], setting) for name in names}
+    chart = chart_of(chosen, given.seed)
+    rows = drawn(given.out, plant, controllers, chart, setting)
     seconds = time.perf_counter() - begin
+    print_table(*table(rows), text_columns=1)
+    steps = len(names) * chart.up.cells * chart.across.cells * round(setting["duration"] / setting["dt"])
+    print(f"{steps / 1e6:,.0f} M steps in {seconds:.1f} s, compilation, files and picture included")
+    print(f"wrote {given.out / 'basin.json'}, basin.png and the runs of each map")
+    return 0
 
-    from cpjax.show.basin import basins
-    from cpjax.show.figures import save_figure
 
-    panels = [panel_of(plant, chart, name, controllers[name], metrics[name]) for name in names]
-    save_figure(given.out / "basin.png", basins(chart, panels))
-    rows = {name: document(chart, metrics[name]) for name in names}
+def drawn(
+    out: Path, plant: CartPole, controllers: Mapping[str, Hybrid], chart: Map, setting: dict[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """The maps of all controllers in a few numbers, with basin.json, basin.png and their runs written."""
+    metrics = {name: mapped(out, plant, chart, name, one, setting) for name, one in controllers.items()}
+    rows = {name: document(chart, found) for name, found in metrics.items()}
     io.write_json(
-        given.out / "basin.json",
+        out / "basin.json",
         {
             "what": "share of a map from which controllers settle: sampled, not certified",
             "versions": io.versions(),
             "map": dataclasses.asdict(chart),
             "run": setting,
             "plant": io.encode(plant),
-            "controllers": {name: io.encode(controllers[name]) for name in names},
+            "controllers": {name: io.encode(one) for name, one in controllers.items()},
             "basins": rows,
-            "files": {name: file_of(name) for name in names},
-            "seconds": seconds,
+            "files": {name: file_of(name) for name in controllers},
         },
     )
-    print_basins(rows)
-    steps = len(names) * chart.up.cells * chart.across.cells * round(setting["duration"] / setting["dt"])
-    print(f"{steps / 1e6:,.0f} M steps in {seconds:.1f} s, compilation and files included")
-    print(f"wrote {given.out / 'basin.json'}, basin.png and the runs of each map")
-    return 0
+
+    from cpjax.show.basin import basins
+    from cpjax.show.figures import save_figure
+
+    panels = [panel_of(plant, chart, name, one, metrics[name]) for name, one in controllers.items()]
+    save_figure(out / "basin.png", basins(chart, panels))
+    return rows
 
 
 def chart_of(chosen: dict[str, Any], seed: int) -> Map:
@@ -125,7 +134,7 @@ def file_of(name: str) -> str:
     return name.replace("/", "-").removesuffix(".json").removesuffix(".toml") + ".npz"
 
 
-def mapped(out: Any, plant: CartPole, chart: Map, name: str, controller: Hybrid, setting: dict[str, Any]) -> Metrics:
+def mapped(out: Path, plant: CartPole, chart: Map, name: str, controller: Hybrid, setting: dict[str, Any]) -> Metrics:
     """The metrics of a controller's map, recorded in `out`."""
     with progress(name) as report:
         metrics: Metrics = record_sweep(
@@ -157,14 +166,23 @@ def _checked(plant: CartPole, controller: Hybrid) -> DesignCheck | None:
         return None
 
 
-def print_basins(rows: dict[str, dict[str, Any]]) -> None:
-    """The table for people."""
+def table(rows: Mapping[str, dict[str, Any]]) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
+    """Title, header and cells, for people."""
 
     def text(value: float | None) -> str:
         return "-" if value is None else f"{value:.3g}"
 
-    header = ("controller", "share [%]", "area", "95 % +-", "settling [s]", "its maximum [s]", "switches", "at most")
     unit = next(iter(rows.values()))["area_unit"]
+    header = (
+        "controller",
+        "share [%]",
+        f"area [{unit}]",
+        "95 % +-",
+        "settling [s]",
+        "its maximum [s]",
+        "switches",
+        "at most",
+    )
     cells = [
         (
             name,
@@ -175,4 +193,4 @@ def print_basins(rows: dict[str, dict[str, Any]]) -> None:
         )
         for name, row in rows.items()
     ]
-    print_table(f"Basins of attraction, sampled [{unit}]", header, cells, text_columns=1)
+    return "Basins of attraction, sampled", header, cells

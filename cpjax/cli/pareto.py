@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.study.comparison import Compared, compare, entries
 from cpjax.study.reproduction import DESIGNS, Setting
+
+Found: TypeAlias = dict[paper.Design, dict[str, Any]]
+"""The fronts of each design, as plain values."""
 
 SUPPLIES = (6.0, 9.0, 24.0)
 _PLANNED = {
@@ -65,23 +68,30 @@ def run(given: argparse.Namespace) -> int:
         if not 0.0 < supply < float("inf"):
             raise InputError("supplies", supply, "finite numbers above 0 [V]")
     plan = FrontPlan(seed=given.seed, **chosen)
-    found = {design: traced(given.out, plant, design, plan, supplies) for design in DESIGNS}
-    compared = compare(plant, entries(plant), Setting(count=plan.final, seed=given.seed))[1]
+    found = made(given.out, plant, plan, supplies)
+    print_table(*table(found), text_columns=2)
+    print(*costs(found), sep="\n")
+    print(f"wrote {given.out / 'pareto.json'}, pareto.png and supplies.png")
+    return 0
+
+
+def made(out: Path, plant: CartPole, plan: Any, supplies: tuple[float, ...]) -> Found:
+    """The fronts of both designs, with pareto.json, pareto.png and supplies.png written; `plan` is a FrontPlan."""
+    found = {design: traced(out, plant, design, plan, supplies) for design in DESIGNS}
+    known = compare(plant, entries(plant), Setting(count=plan.final, seed=plan.seed))[1]
     document = {
         "what": "mean settling time against mean cost, of controllers that no other found beats",
         "versions": io.versions(),
         "plan": dataclasses.asdict(plan),
         "plant": io.encode(plant),
         "fronts": found,
-        "known": [{"name": _name(one), "design": one.entry.design, **one.summary} for one in compared],
+        "known": [{"name": _name(one), "design": one.entry.design, **one.summary} for one in known],
     }
-    io.write_json(given.out / "pareto.json", document)
-    draw(given.out, plant, found, compared)
-    print_fronts(found)
-    print(f"wrote {given.out / 'pareto.json'}, pareto.png and supplies.png")
+    io.write_json(out / "pareto.json", document)
+    draw(out, plant, found, known)
     for design in DESIGNS:
-        _part(given.out, design).unlink(missing_ok=True)
-    return 0
+        _part(out, design).unlink(missing_ok=True)
+    return found
 
 
 def traced(out: Path, plant: CartPole, design: paper.Design, plan: Any, supplies: tuple[float, ...]) -> dict[str, Any]:
@@ -122,7 +132,7 @@ def traced(out: Path, plant: CartPole, design: paper.Design, plan: Any, supplies
     return result
 
 
-def draw(out: Path, plant: CartPole, found: dict[paper.Design, dict[str, Any]], compared: list[Compared]) -> None:
+def draw(out: Path, plant: CartPole, found: Found, compared: list[Compared]) -> None:
     """The pictures."""
     from cpjax.show.figures import save_figure
     from cpjax.show.front import Curve, Known, by_supply, fronts
@@ -162,10 +172,10 @@ def draw(out: Path, plant: CartPole, found: dict[paper.Design, dict[str, Any]], 
     save_figure(out / "supplies.png", by_supply(panels))
 
 
-def print_fronts(found: dict[paper.Design, dict[str, Any]]) -> None:
-    """The table for people."""
-    header = ("regulator", "cost", "supply [V]", "points", "fastest [s]", "cheapest", "volume", "random search")
-    cells = [
+def table(found: Found) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
+    """Title, header and cells, for people."""
+    header = ("regulator", "cost", "supply [V]", "points", "fastest [s]", "cheapest", "hypervolume", "of random search")
+    cells: list[tuple[str, ...]] = [
         (
             design,
             row["cost"],
@@ -179,13 +189,19 @@ def print_fronts(found: dict[paper.Design, dict[str, Any]]) -> None:
         for design in DESIGNS
         for row in found[design]["rows"]
     ]
-    print_table("Fronts of settling time against a cost", header, cells, text_columns=2)
+    return "Fronts of settling time against a cost", header, cells
+
+
+def costs(found: Found) -> list[str]:
+    """What each design's search took, in words."""
+    sentences = []
     for design in DESIGNS:
         steps = {kind: f"{count / 1e6:.0f} M" for kind, count in found[design]["steps"].items()}
-        print(
+        sentences.append(
             f"{design}: {steps['values']} steps of values and {steps['gradients']} of gradients by the tracing, "
             f"{steps['random']} of values by the random search; {found[design]['seconds']:.0f} s"
         )
+    return sentences
 
 
 def _part(out: Path, design: str) -> Path:

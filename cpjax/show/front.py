@@ -14,7 +14,7 @@ COST_LABELS = {
     "cart_travel": "cart travel [m]",
     "voltage_variation": "variation of the voltage [V]",
 }
-_GREY = "#777777"
+MARKERS = {"tuned": "D", "paper, as printed": "^", "paper, corrected": "v"}
 
 
 class Curve(NamedTuple):
@@ -50,11 +50,21 @@ def fronts(
             _draw(axes, design, curve)
         for design, point in bland[cost].items():
             axes.plot(*point, "*", color=DESIGN_COLOURS[design], markersize=11, label=f"{DESIGN_NAMES[design]}, bland")
+        # The view is that of fronts and bland starts; a controller beyond it stands at its edge.
+        shown = np.concatenate(
+            [*(np.concatenate([c.traced, c.random]) for c in designs.values()), [*bland[cost].values()]]
+        )
+        low, high = np.min(shown, axis=0), np.max(shown, axis=0)
+        low, high = low - 0.12 * (high - low), high + 0.12 * (high - low)
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
         for one in known[cost]:
-            label = f"{DESIGN_NAMES[one.design]}, {one.label} ({100 * one.success:.0f} % settle)"
-            marker = ("s" if one.design == "lqr" else "o") if one.label == "tuned" else "Xv"[one.label.endswith("ed")]
-            colour = DESIGN_COLOURS[one.design]
-            axes.plot(one.time, one.cost, marker, color=colour, markerfacecolor="none", markersize=9, label=label)
+            label = (
+                f"{DESIGN_NAMES[one.design]}, {one.label} ({100 * one.success:.0f} % settle, after {one.time:.1f} s)"
+            )
+            at = np.clip([one.time, one.cost], low, high)
+            style = {"color": DESIGN_COLOURS[one.design], "fillstyle": "none", "markersize": 9, "clip_on": False}
+            axes.plot(*at, MARKERS[one.label], label=label, **style)
         axes.set_xlabel("mean settling time [s]")
         axes.set_ylabel("mean " + COST_LABELS[cost])
         axes.grid(alpha=0.3, which="both")
@@ -63,7 +73,7 @@ def fronts(
         label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     figure.legend(
-        handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize="small"
+        handles.values(), handles.keys(), loc="outside lower center", ncols=3, frameon=False, fontsize="small"
     )
     return figure
 
