@@ -213,7 +213,7 @@ def _fronts(page: "Page", given: argparse.Namespace, size: str) -> None:
     page.section("At what price")
     page.text(
         "LQR or pole placement, and what does settling faster cost? Each point is a controller that settles from "
-        f"{100 * plan.success:g} % of unseen starts at least, and that no other found beats in both. They are traced by "
+        f"{100 * plan.success:g} % of unseen starts at least, and that no other found beats in both. Traced by "
         "gradients, many tunings side by side under one `vmap`, each with a bound on its cost; a random search of as "
         "many steps is drawn beside them. The hypervolumes reach up to 1.1 times the bland start."
     )
