@@ -13,7 +13,8 @@ def code_cells(path):
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_its_code_runs(path):
+def test_its_code_runs(path, monkeypatch):
+    monkeypatch.setenv("CPJAX_QUICK", "1")
     scope = {}
     for cell in code_cells(path):
         lines = "".join(cell["source"]).splitlines()

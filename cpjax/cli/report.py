@@ -27,7 +27,14 @@ OPTIONS = [
         "report", "fronts", "of the trade-offs (default quick; full takes minutes)", choices=("none", "quick", "full")
     ),
 ]
-_QUICK: dict[str, Any] = {"bounds": 11, "candidates": 1024, "steps": 24, "judge_every": 6, "final": 512}
+_QUICK: dict[str, Any] = {
+    "bounds": 11,
+    "candidates": 1024,
+    "steps": 24,
+    "judge_every": 6,
+    "semifinal": 128,
+    "final": 256,
+}
 
 
 def add_command(commands: Any) -> None:

@@ -50,7 +50,7 @@ GRADIENT_STEP = 36.0
 _PIECE, _CONTROLLERS = 2048, 64
 """Runs, and controllers that are designed, at a time: always as many, so that both are compiled once."""
 
-_SCREEN, _BATCH, _JUDGE, _FINAL, _CANDIDATES = range(5)  # what random numbers are for
+_SCREEN, _BATCH, _JUDGE, _SEMIFINAL, _FINAL, _CANDIDATES = range(6)  # what random numbers are for
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,10 +74,12 @@ class FrontPlan:
       width: of the target [rad and m].
       judge_every: steps after which all controllers are judged, and exchanged.
       judging: starts by which they are.
-      final: starts that the points of a front are measured from.
-      horizon: of judging and of the last measurement [s].
-      horizon_dt: step and control period there [s].
-      success: share of the last starts that a point must settle from.
+      semifinal: starts by which the best of a front are compared once more: who was lucky with few is not with many.
+      final: unseen starts that the points of a front are measured from.
+      horizon: of all runs that judge [s].
+      judging_dt: step and control period of screening and judging [s].
+      final_dt: of semifinal and final [s].
+      success: share of the starts that a point must settle from in both.
     """
 
     seed: int = 1
@@ -94,10 +96,12 @@ class FrontPlan:
     spare_rate: float = 20.0
     width: float = 0.05
     judge_every: int = 10
-    judging: int = 64
+    judging: int = 96
+    semifinal: int = 256
     final: int = 1024
     horizon: float = 20.0
-    horizon_dt: float = 0.002
+    judging_dt: float = 0.004
+    final_dt: float = 0.002
     success: float = 0.99
 
     def __post_init__(self) -> None:
@@ -237,6 +241,7 @@ class _Tracer:
         plan = self.plan
         starts = _starts(plan, count, purpose)
         controllers, plant = self._controllers(vectors, supply), self.supplied(supply)
+        dt = plan.final_dt if purpose in (_SEMIFINAL, _FINAL) else plan.judging_dt
         runs = len(vectors) * count
         parts = []
         for begin in range(0, runs, _PIECE):
@@ -246,11 +251,11 @@ class _Tracer:
                 jax.tree.map(operator.itemgetter(which), controllers),
                 jax.tree.map(operator.itemgetter(start), starts),
                 duration=plan.horizon,
-                dt=plan.horizon_dt,
+                dt=dt,
                 clock="sampled",
             )
             parts.append(jax.tree.map(np.asarray, metrics))
-        self.value_steps += runs * round(plan.horizon / plan.horizon_dt)
+        self.value_steps += runs * round(plan.horizon / dt)
         table = jax.tree.map(lambda *c: np.concatenate(c)[:runs].astype(float).reshape(-1, count), *parts)
         good = table.success > 0.0
         total = np.sum(good, axis=1)
@@ -269,17 +274,21 @@ class _Tracer:
     def front(self, met: _Judged, supply: float, cost: str, reference: Numbers) -> Front:
         """Of all controllers met, those that no other beats, measured once more from unseen starts."""
         column = COSTS.index(cost)
-        points = np.stack([met.time, met.costs[:, column]], axis=1)
-        points[met.success < 1.0] = np.inf
-        chosen = nondominated(points)
-        final = self.judge(met.vectors[chosen], supply, self.plan.final, _FINAL) if len(chosen) else None
-        if final is None:
-            nothing = np.zeros((0, 2)), np.zeros(0), met.vectors[:0]
-            return Front(*nothing, volume=0.0)
-        points = np.stack([final.time, final.costs[:, column]], axis=1)
-        points[final.success < self.plan.success] = np.inf
-        kept = nondominated(points)
-        return Front(points[kept], final.success[kept], final.vectors[kept], hypervolume(points, reference))
+
+        def points(judged: _Judged, success: float) -> Numbers:
+            found = np.stack([judged.time, judged.costs[:, column]], axis=1)
+            found[judged.success < success] = np.inf
+            return found
+
+        chosen = met.vectors[_layers(points(met, 1.0), 3 * self.plan.bounds)]
+        for count, purpose in ((self.plan.semifinal, _SEMIFINAL), (self.plan.final, _FINAL)):
+            judged = self.judge(chosen, supply, count, purpose)
+            found = points(judged, self.plan.success)
+            kept = nondominated(found)
+            chosen = chosen[kept]
+            if not len(kept):
+                break
+        return Front(found[kept], judged.success[kept], chosen, hypervolume(found[kept], reference))
 
     def trace(self, begun: dict[float, _Judged], fronts: list[tuple[float, str]], report: Report) -> Any:
         """All controllers met, by supply: what `begun` has, and all that were judged on the way."""
@@ -325,8 +334,13 @@ class _Tracer:
         """The bland start and random candidates; the better ones of each front judged on more starts."""
         drawn = np.concatenate([np.asarray(self.free.start())[None], self.draw(supply, count, purpose)])
         screened = self.judge(drawn, supply, self.plan.screening, _SCREEN)
-        better = _layers(screened, 4 * self.plan.bounds)
-        return self.judge(screened.vectors[better], supply, self.plan.judging, _JUDGE)
+        least_failing = screened.success >= np.max(screened.success)
+        better: set[int] = {0}
+        for column in range(len(COSTS)):
+            points = np.stack([screened.time, screened.costs[:, column]], axis=1)
+            points[~least_failing] = np.inf
+            better.update(map(int, _layers(points, 4 * self.plan.bounds)))
+        return self.judge(screened.vectors[sorted(better)], supply, self.plan.judging, _JUDGE)
 
     def _build(self, vector: jax.Array, supply: jax.Array) -> Hybrid:
         return self._supplied(supply).build(vector)
@@ -402,7 +416,7 @@ def trace_fronts(
     values, gradients = tracer.value_steps, tracer.gradient_steps(len(wanted))
     report(plan.steps, plan.steps, "random search of the same cost")
     share = (values + GRADIENT_STEP * gradients) / (1 + len(others))
-    each = plan.screening * round(plan.horizon / plan.horizon_dt)
+    each = plan.screening * round(plan.horizon / plan.judging_dt)
     tracer.value_steps = 0
     drawn = {supply: tracer.begin(supply, int(share / each), 1) for supply in (own, *others)}
     searched = tracer.value_steps
@@ -448,20 +462,15 @@ def _forgotten(leaf: jax.Array, rows: Numbers) -> jax.Array:
     return jnp.where(rows[:, None], 0.0, leaf).astype(leaf.dtype) if leaf.ndim == 2 else leaf
 
 
-def _layers(judged: _Judged, least: int) -> Numbers:
-    """Indices of the controllers that no other beats in some cost, then of those that only they beat, and so on, until
-    there are `least` for each cost or no more that never fail; and the first controller in any case.
+def _layers(points: Numbers, least: int) -> Numbers:
+    """Indices of the points (n, 2) that no other beats, then of those that only they beat, and so on, until there are
+    `least` or no more that are finite; the first point if none is.
     """
-    chosen = {0}
-    for column in range(len(COSTS)):
-        points = np.stack([judged.time, judged.costs[:, column]], axis=1)
-        points[judged.success < np.max(judged.success)] = np.inf
-        taken = 0
-        while taken < least and len(layer := nondominated(points)):
-            chosen.update(map(int, layer))
-            taken += len(layer)
-            points[layer] = np.inf
-    return np.array(sorted(chosen), int)
+    left, chosen = np.array(points), np.zeros(0, int)
+    while len(chosen) < least and len(layer := nondominated(left)):
+        chosen = np.concatenate([chosen, layer])
+        left[layer] = np.inf
+    return chosen if len(chosen) else np.zeros(1, int)
 
 
 def _together(parts: list[_Judged]) -> _Judged:

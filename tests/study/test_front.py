@@ -43,11 +43,12 @@ def test_the_fastest_within_a_bound_never_fails_if_any_does_not():
     assert (vector, time) == (3.0, math.inf)  # none keeps to it: the cheapest of those that never fail
 
 
-def test_layers_begin_with_what_no_other_beats_and_leave_out_what_fails():
-    met = judged([(1.0, 9.0, 90.0), (1.0, 1.0, 5.0), (1.0, 2.0, 4.0), (1.0, 3.0, 6.0), (0.5, 0.1, 0.1)])
-    assert _layers(met, 2).tolist() == [0, 1, 2]  # 0 is the first controller
-    assert _layers(met, 3).tolist() == [0, 1, 2, 3]
-    assert 4 not in _layers(met, 100)
+def test_layers_begin_with_what_no_other_beats_and_end_with_what_is_finite():
+    points = np.array([[9.0, 90.0], [1.0, 5.0], [2.0, 4.0], [3.0, 6.0], [np.inf, np.inf]])
+    assert _layers(points, 2).tolist() == [1, 2]
+    assert _layers(points, 3).tolist() == [1, 2, 3]
+    assert sorted(_layers(points, 100)) == [0, 1, 2, 3]
+    assert _layers(points[4:], 2).tolist() == [0]
 
 
 @pytest.mark.parametrize(
@@ -61,7 +62,7 @@ def test_a_bad_plan_is_refused(change, field):
 
 @pytest.mark.slow
 def test_a_small_front_is_made_of_controllers_that_do_what_its_points_say():
-    plan = FrontPlan(bounds=4, candidates=256, steps=6, judge_every=3, final=64, horizon=10.0, horizon_dt=0.004)
+    plan = FrontPlan(bounds=4, candidates=256, steps=6, judge_every=3, semifinal=64, final=64, horizon=10.0)
     found = trace_fronts(PLANT, "placement", plan, report=lambda *_: None)
     for cost in COSTS:
         front = found.traced[12.0, cost]

@@ -1,0 +1,62 @@
+"""A picture of one swing-up that follows its controller's numbers: what the sliders of a notebook move."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+from cpjax.controllers import Hybrid
+from cpjax.plant import CartPole
+from cpjax.show.figures import DESIGN_COLOURS
+from cpjax.sim.rollout import Trajectory, rollout
+from cpjax.state import HANGING, State
+
+
+class Explorer:
+    """Angle, cart and voltage of a controller, drawn once and moved afterwards.
+
+    The rollout is compiled once: another gain, weight, pole or gate is another number in the same program.
+
+    Attributes:
+      figure: what is drawn.
+    """
+
+    def __init__(
+        self, plant: CartPole, start: State = HANGING, *, duration: float = 6.0, dt: float = 0.002, save_every: int = 10
+    ) -> None:
+        def run(controller: Hybrid) -> Trajectory:
+            return rollout(plant, controller, start, duration=duration, dt=dt, clock="sampled", save_every=save_every)
+
+        self._run = jax.jit(run)
+        self.figure = Figure(figsize=(8, 4.8), dpi=72)
+        self.figure.subplots_adjust(left=0.1, right=0.98, top=0.92, bottom=0.11, hspace=0.12)
+        axes = self.figure.subplots(3, 1, sharex=True)
+        limit = float(plant.motor.voltage_limit)
+        labels = ("angle from\nupright [rad]", "x [m]", "voltage [V]")
+        ranges = ((-np.pi, np.pi), (-2.0, 2.0), (-1.1 * limit, 1.1 * limit) if np.isfinite(limit) else (-30.0, 30.0))
+        self._lines = []
+        for panel, label, ends in zip(axes, labels, ranges, strict=True):
+            (line,) = panel.plot([], [], color=DESIGN_COLOURS["placement"], linewidth=1.3)
+            self._lines.append(line)
+            panel.set_ylabel(label)
+            panel.set_ylim(*ends)
+            panel.grid(alpha=0.3)
+        axes[0].set_xlim(0.0, duration)
+        axes[-1].set_xlabel("time [s]")
+        self._title = axes[0].set_title("")
+
+    def show(self, controller: Hybrid) -> Figure:
+        """The picture of this controller."""
+        run = jax.tree.map(np.asarray, self._run(controller))
+        theta: np.ndarray[Any, Any] = np.mod(run.state.theta + np.pi, 2.0 * np.pi) - np.pi
+        theta[1:][np.abs(np.diff(theta)) > np.pi] = np.nan  # a gap where it goes round
+        for line, values in zip(self._lines, (theta, run.state.x, run.voltage), strict=True):
+            line.set_data(run.time, values)
+        found = run.metrics
+        if np.isfinite(found.settling_time):
+            words = f"settles after {found.settling_time:.2f} s, travel {found.cart_travel:.2f} m, "
+            self._title.set_text(words + f"effort {found.effort:.0f} V$^2$ s, {found.switches} changes of mode")
+        else:
+            self._title.set_text(f"does not settle in {run.time[-1]:.0f} s")
+        return self.figure
