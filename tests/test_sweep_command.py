@@ -58,6 +58,7 @@ def test_trajectories_go_to_a_folder(tmp_path, capsys):
         (("--count", "0"), "count"),
         (("--save-every", "3"), "save_every"),
         (("--dt", "-1"), "dt"),
+        (("--dt", "nan"), "dt"),
     ],
 )
 def test_bad_options_are_refused_by_name(arguments, named, tmp_path, capsys):

@@ -59,12 +59,11 @@ def run(given: argparse.Namespace) -> int:
     save_every = chosen.get("save_every")
     path = given.out / ("trajectories" if save_every is not None else f"metrics.{chosen['format']}")
     fold = ProtocolMetrics(reference_x=sections["controller"].get("reference_x", 0.0))
-    steps = round(setting["duration"] / setting["dt"])
     begin = time.perf_counter()
     with progress("sweep") as report:
 
         def tell(done: int, total: int) -> None:
-            rate = done * steps / (time.perf_counter() - begin) / 1e6
+            rate = done * round(setting["duration"] / setting["dt"]) / (time.perf_counter() - begin) / 1e6
             report(done, total, f"starts, {rate:.0f} M steps/s")
 
         metrics = record_sweep(
@@ -80,6 +79,7 @@ def run(given: argparse.Namespace) -> int:
             progress=tell,
         )
     seconds = time.perf_counter() - begin
+    steps = round(setting["duration"] / setting["dt"])
     speed = f"{count * steps / 1e6:.0f} M steps in {seconds:.1f} s, compilation and files included"
     if metrics is None:
         print(f"{speed}\nwrote {path}")

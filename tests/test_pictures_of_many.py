@@ -1,0 +1,104 @@
+"""The commands that map, trade off and animate: what they write, and what they refuse."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import cpjax
+from cpjax.show import animation
+from cpjax.show.figures import DESIGN_COLOURS
+from cpjax.study.recording import read_sweep
+
+
+def test_basin_writes_maps_whose_shares_are_those_of_the_runs_beside_them(command, tmp_path):
+    arguments = ("--cells", 6, "--theta", -1, 1, "--controllers", "tuned_place", "corrected/lqr", "--duration", 3)
+    done = command("basin", *arguments, "--x", -0.1, 0.1, "--out", tmp_path)
+    assert done.code == 0, done.err
+    document = json.loads((tmp_path / "basin.json").read_text())
+    assert document["map"]["others"] == {"x": [-0.1, 0.1]}
+    for name, row in document["basins"].items():
+        _, columns = read_sweep(tmp_path / document["files"][name])
+        assert row["share"] == np.mean(columns["success"])
+        assert len(columns["success"]) == 36
+        assert f"{100 * row['share']:.2f}" in done.out
+    assert document["basins"]["tuned_place"]["share"] > document["basins"]["corrected/lqr"]["share"]
+    assert (tmp_path / "basin.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_animate_draws_as_many_pictures_as_it_says_in_each_controllers_colour(command, tmp_path):
+    arguments = ("--controllers", "tuned_place", "corrected/lqr", "--duration", 0.4, "--rate", 10)
+    assert command("animate", *arguments, "--out", tmp_path).code == 0
+    with Image.open(tmp_path / "animation.gif") as picture:
+        assert picture.n_frames == 5
+        assert picture.info["duration"] == 100
+        first = np.asarray(picture.convert("RGB"), int)
+    half = first.shape[1] // 2
+    for part, design in ((first[:, :half], "placement"), (first[:, half:], "lqr")):
+        wanted = [int(DESIGN_COLOURS[design][i : i + 2], 16) for i in (1, 3, 5)]
+        assert np.min(np.abs(part - wanted).sum(axis=2)) < 40, design
+
+
+def test_an_animation_as_a_page_holds_the_runs_and_asks_for_nothing(command, tmp_path):
+    assert command("animate", "--format", "html", "--duration", 0.5, "--out", tmp_path).code == 0
+    page = (tmp_path / "animation.html").read_text()
+    assert "http" not in page
+    assert "url(" not in page
+    data = json.loads(page.split("const data = ")[1].split(";\n")[0])
+    assert [scene["title"] for scene in data["scenes"]] == ["corrected/lqr", "tuned_lqr"]
+    plant = cpjax.paper.appendix_plant()
+    run = cpjax.rollout(plant, cpjax.preset("lqr"), cpjax.HANGING, duration=0.5, dt=0.002, clock="sampled")
+    np.testing.assert_allclose(data["scenes"][1]["theta"], np.asarray(run.state.theta)[::25], atol=1e-4)
+    np.testing.assert_allclose(data["scenes"][1]["voltage"], np.asarray(run.voltage)[::25], atol=1e-3)
+
+
+def test_without_an_encoder_a_film_becomes_a_page(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(animation, "encoder", lambda: None)
+    done = command("animate", "--format", "mp4", "--duration", 0.1, "--out", tmp_path)
+    assert done.code == 0
+    assert "no ffmpeg" in done.out
+    assert (tmp_path / "animation.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("basin", "--theta", "1", "-1"), "high"),
+        (("basin", "--across", "x", "--up", "x"), "up"),
+        (("basin", "--cells", "0"), "cells"),
+        (("basin", "--controllers", "corrected/nothing"), "controller"),
+        (("basin", "--controllers", "tuned_lqr", "tuned_lqr"), "controllers"),
+        (("basin", "--dt", "nan"), "dt"),
+        (("pareto", "--bounds", "0"), "bounds"),
+        (("pareto", "--supplies", "nan"), "supplies"),
+        (("animate", "--rate", "0"), "rate"),
+        (("animate", "--duration", "nan"), "duration"),
+        (("report", "--cells", "-1"), "cells"),
+    ],
+)
+def test_bad_input_is_named_in_one_line(command, tmp_path, arguments, named):
+    done = command(*arguments, "--out", tmp_path)
+    assert done.code == 2
+    assert named in done.err
+    assert len(done.err.strip().splitlines()) <= 2  # progress, at most, before
+
+
+@pytest.mark.slow
+def test_pareto_keeps_a_finished_design_when_it_is_stopped(command, tmp_path, monkeypatch):
+    from cpjax.cli import pareto
+
+    small = ("--bounds", 2, "--candidates", 64, "--steps", 2, "--final", 16, "--supplies", 12, "--out", tmp_path)
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pareto, "compare", stop)
+        assert command("pareto", *small).code == 130
+    parts = sorted(tmp_path.glob("*.part.json"))
+    assert len(parts) == 2
+    assert command("pareto", *small).code == 0
+    assert not list(tmp_path.glob("*.part.json"))
+    document = json.loads((tmp_path / "pareto.json").read_text())
+    assert {row["cost"] for row in document["fronts"]["lqr"]["rows"]} == {"effort", "cart_travel", "voltage_variation"}
