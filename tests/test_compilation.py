@@ -168,6 +168,7 @@ def heavy(law, state):
     return value
 
 
+@pytest.mark.slow
 def test_a_heavy_law_for_many_starts_is_not_shared_out_within_the_function():
     """XLA marks what is worth several cores, and there are none to share it out to inside one function."""
     controller, starts = law(heavy)(), jnp.linspace(2.0, 3.0, 512)

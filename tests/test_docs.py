@@ -41,7 +41,8 @@ def test_every_command_is_shown_somewhere():
     assert [name for name in commands if f"    cpjax {name}" not in shown] == []
 
 
-@pytest.mark.parametrize("page", ["how-to", pytest.param("tutorial", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["how-to", "tutorial"])
 def test_its_python_runs(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     text = (DOCS / f"{page}.md").read_text()

@@ -16,6 +16,10 @@ DESIGNS = {"continuous": lqr, "discrete": dlqr}
 PEERS = {"continuous": control.lqr, "discrete": control.dlqr}
 BATCHED = {time: jax.jit(jax.vmap(design)) for time, design in DESIGNS.items()}  # twenty lanes, always
 both = pytest.mark.parametrize("time", DESIGNS)
+# What weights and dtypes do to a gain is the same code for both.
+continuous_discrete_slow = pytest.mark.parametrize(
+    "time", ["continuous", pytest.param("discrete", marks=pytest.mark.slow)]
+)
 
 A, B = (np.asarray(matrix) for matrix in linearize(paper.appendix_plant()))
 Q, R = np.diag(paper.Q), np.array([[paper.R]])
@@ -75,7 +79,7 @@ def test_the_paper_plant_has_the_gain_that_follows_from_its_weights():
     assert relative_error(discrete.K, control.dlqr(*PAPER["discrete"])[0]) <= 1e-10
 
 
-@both
+@continuous_discrete_slow
 def test_only_the_ratio_of_the_weights_matters(time):
     A, B, Q, R = PAPER[time]
     N = np.array([[1.0], [0.5], [0.1], [0.2]]) * 1e-3
@@ -154,7 +158,7 @@ def test_one_state_has_the_gain_of_a_quadratic_equation(a, b, q, r):
     assert float(dlqr(*problem).K[0, 0]) == pytest.approx(a * b * p / (r + b * b * p), rel=1e-14)
 
 
-@both
+@continuous_discrete_slow
 def test_float32_arguments_give_the_papers_gain_to_a_few_of_their_digits(time):
     narrow = [matrix.astype(np.float32) for matrix in PAPER[time]]
     K, P = DESIGNS[time](*narrow)

@@ -258,7 +258,7 @@ def test_a_weak_actuator_that_is_cheap_is_as_good_as_a_strong_one(time):
     np.testing.assert_array_equal(2.0**-50 * weak.K, strong.K)
 
 
-@both
+@continuous_discrete_slow
 def test_a_weight_that_is_semidefinite_but_for_the_rounding_of_its_printing_is_accepted_or_named(time):
     rng = np.random.default_rng(8)
     A, B, c = rng.normal(size=(3, 3)), rng.normal(size=(3, 1)), rng.normal(size=(3, 1))
