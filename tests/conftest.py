@@ -1,6 +1,14 @@
 """Every test runs in float64 with strict dtype promotion; what is about float32 asks for it by name."""
 
+import os
+from pathlib import Path
 from types import SimpleNamespace
+
+# What one test, worker or process of the tests has compiled no other compiles again. With a bound on its size JAX locks
+# the folder, so that workers can share it. Delete it at will.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent.parent / "build" / "compilations"))
+os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(1 << 32))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 import jax
 import pytest

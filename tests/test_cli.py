@@ -760,7 +760,7 @@ def report(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", buffers.StringIO())
         patch.setattr(sys, "stderr", buffers.StringIO())
-        code = main(["report", "--out", str(folder), *EVALUATION, "--cells", "8", "--fronts", "none"])
+        code = main(["report", "--out", str(folder), *EVALUATION, "--cells", "0", "--fronts", "none"])
     text = (folder / "report.html").read_text(encoding="utf-8")
     return SimpleNamespace(folder=folder, code=code, text=text, page=Page(text))
 
@@ -768,7 +768,6 @@ def report(tmp_path_factory):
 def test_a_report_writes_its_page_beside_the_rows_and_pictures(report):
     assert report.code == 0
     data = {"reproduction.json", "designs.json", "audit_gains.json", "compare.json", "responses.png", "by_start.png"}
-    data |= {"basin.json", "basin.png", *(file_of(name) for name in CONTROLLERS)}
     assert {p.name for p in report.folder.iterdir()} == {"report.html", "audit_gains.png", *data, *FIGURES}
 
 
@@ -793,7 +792,7 @@ def test_a_report_is_one_valid_page_that_loads_nothing_from_elsewhere(report):
 
 def test_every_picture_of_a_report_is_inside_it_and_described(report):
     pictures = [attributes for tag, attributes in report.page.tags if tag == "img"]
-    assert len(pictures) == len(FIGURES) + 4  # the audit's, the comparison's two, and the basins'
+    assert len(pictures) == len(FIGURES) + 3  # the audit's, and the comparison's two
     for picture in pictures:
         assert picture["src"].startswith("data:image/png;base64,iVBOR")
         assert len(picture["alt"]) > 20
@@ -856,18 +855,28 @@ def test_the_comparison_in_a_report_is_that_of_its_json(report):
         assert cells[5] == f"{row['over_successes']['settling_time']['mean']:.2f}"
 
 
-def test_the_basins_in_a_report_are_those_of_its_json(report):
-    basins = document(report.folder, "basin.json")["basins"]
-    shown = [cells for cells in report.page.rows if cells and cells[0] in CONTROLLERS]
+@pytest.mark.slow
+def test_basins_and_fronts_in_a_report_are_those_of_its_json(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(cpjax.cli.report, "_forensics", lambda page, given: None)
+    small = {"bounds": 2, "candidates": 64, "steps": 2, "semifinal": 16, "final": 16}
+    monkeypatch.setattr(cpjax.cli.report, "_QUICK", small)
+    assert command("report", "--out", tmp_path, *EVALUATION, "--cells", "8").code == 0
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    basins = document(tmp_path, "basin.json")["basins"]
+    shown = [cells for cells in page.rows if cells and cells[0] in CONTROLLERS]
     assert [cells[0] for cells in shown] == list(CONTROLLERS)
-    for cells in shown:
-        assert cells[1] == f"{100 * basins[cells[0]]['share']:.2f}"
+    assert [cells[1] for cells in shown] == [f"{100 * basins[cells[0]]['share']:.2f}" for cells in shown]
+    assert all((tmp_path / file_of(name)).exists() for name in CONTROLLERS)
+    fronts = document(tmp_path, "pareto.json")["fronts"]["lqr"]["rows"]
+    rows = [cells for cells in page.rows if cells and cells[0] == "lqr" and cells[1] == "cart_travel"]
+    expected = next(row for row in fronts if row["cost"] == "cart_travel")["traced"]["volume"]
+    assert rows[0][6] == f"{expected:.4g}"
 
 
 def test_a_report_names_its_setting_and_the_command_that_makes_it_again(report):
     text = "".join(report.page.words)
     assert "8 starts from the set hanging (seed 1), 12 s each, RK4 with a step of 10 ms" in text
-    assert "cpjax report --starts hanging --count 8 --seed 1 --duration 12 --dt 0.01 --cells 8 --fronts none" in text
+    assert "cpjax report --starts hanging --count 8 --seed 1 --duration 12 --dt 0.01 --cells 0 --fronts none" in text
 
 
 @pytest.mark.slow

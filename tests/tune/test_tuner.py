@@ -27,6 +27,7 @@ def tuner():
     return _Tuner(PLANT, free_parameters(beginning("bland", "placement", PLANT)), SMALL)
 
 
+@pytest.mark.slow
 def test_stopped_at_any_checkpoint_it_ends_in_the_same_bits(tuner, tmp_path):
     """Each memory goes through a file before the next step, and must change nothing."""
     whole = stopped = tuner.begin()
@@ -117,6 +118,7 @@ def test_a_batch_is_aggregated_as_the_plan_says(aggregate):
     assert float(plan.aggregated(values)) == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_start_that_cannot_be_simulated_does_no_harm(tuner):
     starts, _ = tuner._draw(2, 1, 0)
     bad = dataclasses.replace(starts, theta_dot=jnp.asarray([0.1, jnp.nan]))
