@@ -1,6 +1,7 @@
 """The command line. Each command is a file here: it declares options, calls the library, prints and writes."""
 
 import argparse
+import importlib
 import re
 import sys
 from collections.abc import Sequence
@@ -15,6 +16,23 @@ exit codes:
   2    bad input: one line on standard error names the field, the value and what is allowed
   130  interrupted
 """
+
+
+_COMMANDS = (
+    "swingup",
+    "sweep",
+    "design",
+    "reproduce",
+    "audit_gains",
+    "audit_gradients",
+    "tune",
+    "compare",
+    "basin",
+    "pareto",
+    "animate",
+    "report",
+)
+"""Modules of this package, in the order in which the help lists them."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -32,21 +50,6 @@ class _Parser(argparse.ArgumentParser):
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    from cpjax.cli import (
-        animate,
-        audit_gains,
-        audit_gradients,
-        basin,
-        compare,
-        design,
-        pareto,
-        report,
-        reproduce,
-        sweep,
-        swingup,
-        tune,
-    )
-
     parser = _Parser(
         prog="cpjax",
         description="A motor-driven cart-pole: swing-up, catch, and the numbers behind them.",
@@ -55,21 +58,8 @@ def make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=_version())
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
-    for module in (
-        swingup,
-        sweep,
-        design,
-        reproduce,
-        audit_gains,
-        audit_gradients,
-        tune,
-        compare,
-        basin,
-        pareto,
-        animate,
-        report,
-    ):
-        module.add_command(commands)
+    for name in _COMMANDS:
+        importlib.import_module(f"cpjax.cli.{name}").add_command(commands)
     return parser
 
 

@@ -7,6 +7,7 @@ come from the fields of the classes themselves.
 
 import argparse
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
@@ -261,12 +262,10 @@ def named_hybrid(name: str, plant: CartPole) -> Hybrid:
     """A controller in one word: a preset, a file, or the paper's LAW/DESIGN or LAW/DESIGN/GAINS."""
     law, *others = name.split("/")
     if law in paper.LAWS and Path(name).suffix.lower() not in (".json", ".toml"):
-        words = dict(zip(("design", "gains"), others, strict=False))
-        known = {"design": get_args(paper.Design), "gains": get_args(paper.Gains)}
-        if not 1 <= len(others) <= 2 or any(word not in known[key] for key, word in words.items()):
-            raise InputError("controller", name, f"{law}/lqr or {law}/placement, and after it /printed or /computed")
-        design, gains = words["design"], words.get("gains", "printed")
-        return paper.controller(law, design, plant, gains)  # type: ignore[arg-type]  # seen to be among the known
+        for design, gains in itertools.product(get_args(paper.Design), get_args(paper.Gains)):
+            if others in ([design], [design, gains]):  # "printed" comes first
+                return paper.controller(law, design, plant, gains)
+        raise InputError("controller", name, f"{law}/lqr or {law}/placement, and after it /printed or /computed")
     controller = saved_controller(name)
     if not isinstance(controller, Hybrid):
         raise InputError("controller", name, "a Hybrid: a regulator behind a gate")

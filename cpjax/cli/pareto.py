@@ -15,6 +15,7 @@ from cpjax.cli.tables import print_table
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.study.comparison import Compared, compare, entries
+from cpjax.study.front_plan import COSTS, FrontPlan
 from cpjax.study.reproduction import DESIGNS, Setting
 
 Found: TypeAlias = dict[paper.Design, dict[str, Any]]
@@ -22,15 +23,15 @@ Found: TypeAlias = dict[paper.Design, dict[str, Any]]
 
 SUPPLIES = (6.0, 9.0, 24.0)
 _PLANNED = {
-    "bounds": ("tunings for each cost and supply", int, 31),
-    "candidates": ("random controllers to begin with", int, 4096),
-    "steps": ("of the optimiser", int, 100),
-    "batch": ("starts of a step", int, 8),
-    "final": ("starts that the points are measured from", int, 1024),
+    "bounds": "tunings for each cost and supply",
+    "candidates": "random controllers to begin with",
+    "steps": "of the optimiser",
+    "batch": "starts of a step",
+    "final": "starts that the points are measured from",
 }
 
 OPTIONS = [
-    *(Option("front", key, f"{text} (default {value})", kind) for key, (text, kind, value) in _PLANNED.items()),
+    *(Option("front", key, f"{text} (default {getattr(FrontPlan, key)})", int) for key, text in _PLANNED.items()),
     Option(
         "front",
         "supplies",
@@ -58,8 +59,6 @@ def add_command(commands: Any) -> None:
 
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
-    from cpjax.study.front import FrontPlan  # optax takes a while; other commands should not wait for it
-
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     chosen = dict(sections["front"])
@@ -75,8 +74,8 @@ def run(given: argparse.Namespace) -> int:
     return 0
 
 
-def made(out: Path, plant: CartPole, plan: Any, supplies: tuple[float, ...]) -> Found:
-    """The fronts of both designs, with pareto.json, pareto.png and supplies.png written; `plan` is a FrontPlan."""
+def made(out: Path, plant: CartPole, plan: FrontPlan, supplies: tuple[float, ...]) -> Found:
+    """The fronts of both designs, with pareto.json, pareto.png and supplies.png written."""
     found = {design: traced(out, plant, design, plan, supplies) for design in DESIGNS}
     known = compare(plant, entries(plant), Setting(count=plan.final, seed=plan.seed))[1]
     document = {
@@ -94,9 +93,11 @@ def made(out: Path, plant: CartPole, plan: Any, supplies: tuple[float, ...]) -> 
     return found
 
 
-def traced(out: Path, plant: CartPole, design: paper.Design, plan: Any, supplies: tuple[float, ...]) -> dict[str, Any]:
+def traced(
+    out: Path, plant: CartPole, design: paper.Design, plan: FrontPlan, supplies: tuple[float, ...]
+) -> dict[str, Any]:
     """A design's fronts as plain values, from the part that an interrupted run left if there is one."""
-    from cpjax.study.front import trace_fronts
+    from cpjax.study.front import trace_fronts  # optax takes a while; other commands should not wait for it
 
     request = io.dump_json(
         {"plan": dataclasses.asdict(plan), "plant": io.encode(plant), "supplies": supplies, "versions": io.versions()}
@@ -136,7 +137,6 @@ def draw(out: Path, plant: CartPole, found: Found, compared: list[Compared]) -> 
     """The pictures."""
     from cpjax.show.figures import save_figure
     from cpjax.show.front import Curve, Known, by_supply, fronts
-    from cpjax.study.front import COSTS
 
     own = float(plant.motor.voltage_limit)
 

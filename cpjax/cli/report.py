@@ -13,6 +13,7 @@ from cpjax.controllers import AngleGate
 from cpjax.errors import InputError
 from cpjax.study.design_check import check_design, document
 from cpjax.study.forensics import audit_gains, write
+from cpjax.study.front_plan import FrontPlan
 from cpjax.study.printed_gains import printed_in_the_paper
 from cpjax.study.reproduction import Setting
 
@@ -213,8 +214,6 @@ def _basins(page: "Page", given: argparse.Namespace, cells: int) -> None:
 
 def _fronts(page: "Page", given: argparse.Namespace, size: str) -> None:
     """What settling faster costs."""
-    from cpjax.study.front import FrontPlan
-
     plan = FrontPlan(seed=given.seed, **(_QUICK if size == "quick" else {}))
     found = pareto.made(given.out, paper.appendix_plant(), plan, pareto.SUPPLIES)
     page.section("At what price")

@@ -101,7 +101,6 @@ def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -
     # Positions are angles in the plane in which the shadow is about as wide as it is high: however far apart angle and
     # rate are in size, the level changes over no small part of a turn.
     ratio = half_angle * jnp.sqrt(shadow[1, 1]) / (rate * jnp.sqrt(shadow[0, 0]))
-    ratio = lax.stop_gradient(ratio)  # the level does not depend on how its boundary is numbered
 
     def level(position: jax.Array, form: jax.Array, half_angle: jax.Array, rate: jax.Array) -> jax.Array:
         """At a point of the boundary, half of which is passed as `position` goes from 0 to pi."""

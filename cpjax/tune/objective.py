@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from cpjax.errors import InputError
+from cpjax.numeric.extremes import larger
 from cpjax.plant import CartPole
 from cpjax.pytree import Scalar, number, part, pytree
 from cpjax.sim.metrics import Fold, Sample, TimeOutside
@@ -135,11 +136,23 @@ class Unfinished:
 
 
 @pytree
-class WeightedSum:
-    """Several folds at once, and the sum of their results, each times its weight."""
+class Travel:
+    """max |x| [m]."""
+
+    def init(self, sample: Sample) -> jax.Array:
+        return jnp.zeros_like(sample.time)
+
+    def update(self, memory: jax.Array, sample: Sample) -> jax.Array:
+        return larger(memory, jnp.abs(sample.state.x))
+
+    def finish(self, memory: jax.Array, last: Sample) -> jax.Array:
+        return memory
+
+
+class _Several:
+    """Several folds at once."""
 
     terms: tuple[Any, ...]
-    weights: tuple[Scalar, ...]
 
     def init(self, sample: Sample) -> tuple[Any, ...]:
         return tuple(term.init(sample) for term in self.terms)
@@ -147,12 +160,37 @@ class WeightedSum:
     def update(self, memory: tuple[Any, ...], sample: Sample) -> tuple[Any, ...]:
         return tuple(term.update(m, sample) for term, m in zip(self.terms, memory, strict=True))
 
+    def _results(self, memory: tuple[Any, ...], last: Sample) -> list[Any]:
+        return [term.finish(m, last) for term, m in zip(self.terms, memory, strict=True)]
+
+
+@pytree
+class WeightedSum(_Several):
+    """The sum of several folds' results, each times its weight."""
+
+    terms: tuple[Any, ...]
+    weights: tuple[Scalar, ...]
+
     def finish(self, memory: tuple[Any, ...], last: Sample) -> jax.Array:
-        results = [term.finish(m, last) for term, m in zip(self.terms, memory, strict=True)]
         total = jnp.zeros_like(last.time)
-        for weight, result in zip(self.weights, results, strict=True):
+        for weight, result in zip(self.weights, self._results(memory, last), strict=True):
             total = total + jnp.asarray(weight, dtype=total.dtype) * result
         return total
+
+
+@pytree
+class BoundedTime(_Several):
+    """The time outside the target [s], and `penalty` times what each cost exceeds its bound by, relative to it."""
+
+    terms: tuple[Any, ...]
+    """The time, the costs, and the time that a stopped run left undone."""
+    bounds: tuple[Any, ...]
+    penalty: Any
+
+    def finish(self, memory: tuple[Any, ...], last: Sample) -> jax.Array:
+        time, *costs, undone = self._results(memory, last)
+        excess = sum(jnp.maximum(cost / bound - 1.0, 0.0) for cost, bound in zip(costs, self.bounds, strict=True))
+        return time + undone * (1.0 + self.penalty) + self.penalty * excess
 
 
 @pytree

@@ -7,7 +7,6 @@ start and what to keep, and gradients do the work in between.
 
 import functools
 import math
-import operator
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +25,7 @@ from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import measure
 from cpjax.starts import sample_starts
 from cpjax.state import State
+from cpjax.tune import descent
 from cpjax.tune.checkpoint import Memory, restore, store
 from cpjax.tune.outcome import Tuning, request
 from cpjax.tune.parameters import FreeParameters, Vector
@@ -106,7 +106,7 @@ class _Tuner:
         """Screens the candidates; the first restart is the given controller."""
         plan = self.plan
         given = np.asarray(self.free.start())[None]
-        random = np.random.default_rng(_seed(plan, _CANDIDATES, 0))
+        random = np.random.default_rng(descent.seed_of(plan.seed, _CANDIDATES, 0))
         drawn = self.free.draw(random, plan.candidates, short_track=math.isfinite(plan.goal.track_limit))
         vectors = np.concatenate([given, drawn.astype(given.dtype)])
         starts, steps = plan.screening, 0
@@ -132,10 +132,7 @@ class _Tuner:
         for step in range(memory.step, end):
             starts, plants = self._draw(plan.batch, _STEP, step // plan.resample if plan.resample else 0)
             loss, slope = self.gradient(vectors, starts, plants, jnp.asarray(plan.width(step), vectors.dtype))
-            with jax.numpy_dtype_promotion("standard"):  # optax's own arithmetic mixes dtypes
-                change, state = self.optimiser.update(slope, state)
-                moved = optax.apply_updates(vectors, change)
-            vectors = jnp.where(jnp.isfinite(moved), moved, vectors)
+            vectors, state = descent.step(self.optimiser, vectors, state, slope)
         spent = (end - memory.step) * vectors.shape[0] * plan.batch * self.iterations
         memory = memory._replace(
             step=end, vectors=np.asarray(vectors), optimiser=state, gradient_steps=memory.gradient_steps + spent
@@ -151,7 +148,7 @@ class _Tuner:
         if half == 0 or plan.explore == 0.0:
             return memory
         losers, winners = order[len(order) - half :], order[:half]
-        random = np.random.default_rng(_seed(plan, _NOISE, memory.step))
+        random = np.random.default_rng(descent.seed_of(plan.seed, _NOISE, memory.step))
         size = plan.explore * (1.0 - memory.step / plan.steps)
         noise = size * random.standard_normal((half, memory.best.shape[1]))
         vectors, best, scores = (np.array(x) for x in (memory.vectors, memory.best, memory.scores))
@@ -219,10 +216,11 @@ class _Tuner:
     def _draw(self, count: int, purpose: int, step: int = 0) -> tuple[State, CartPole | None]:
         plan = self.plan
         dtype = np.dtype(jnp.result_type(float))
-        starts = sample_starts(plan.starts, count, seed=_seed(plan, purpose, 2 * step), dtype=dtype)
+        starts = sample_starts(plan.starts, count, seed=descent.seed_of(plan.seed, purpose, 2 * step), dtype=dtype)
         plants = None
         if plan.plant_spread > 0.0:
-            drawn = sample_plants(self.plant, count, spread=plan.plant_spread, seed=_seed(plan, purpose, 2 * step + 1))
+            seed = descent.seed_of(plan.seed, purpose, 2 * step + 1)
+            drawn = sample_plants(self.plant, count, spread=plan.plant_spread, seed=seed)
             plants = jax.tree.map(lambda column: jnp.asarray(column, dtype), drawn)
         return jax.tree.map(jnp.asarray, starts), plants
 
@@ -239,10 +237,7 @@ class _Tuner:
         values, slopes = jax.vmap(functools.partial(jax.value_and_grad(objective), vector))(starts, plants)
         sound = jnp.all(jnp.isfinite(slopes), axis=1) & jnp.isfinite(values)
         slopes = jnp.where(sound[:, None], slopes, 0.0)
-        norms = jnp.sqrt(jnp.sum(slopes * slopes, axis=1))
-        median = jnp.nan_to_num(jnp.nanmedian(jnp.where(sound, norms, jnp.nan)))
-        tiny = float(np.finfo(norms.dtype).tiny)
-        shortened = jnp.minimum(1.0, plan.clip * median / jnp.maximum(norms, tiny))
+        shortened = descent.shortened(slopes, sound, plan.clip)
         worst = jnp.max(jnp.where(sound, values, -jnp.inf))
         values = jnp.where(sound, values, worst)
         loss, shares = jax.value_and_grad(plan.aggregated)(values)
@@ -268,14 +263,14 @@ class _Tuner:
         final = purpose == _FINAL
         horizon = plan.final_horizon if final else plan.horizon
         block = min(_BLOCK, plan.restarts * plan.validation)
-        controllers, poles = _in_blocks(self.controllers, min(block, _CONTROLLERS), jnp.asarray(vectors))
+        controllers, poles = descent.in_blocks(self.controllers, min(block, _CONTROLLERS), jnp.asarray(vectors))
 
         def over(run: Any, starts_each: int) -> Any:
             """Of every controller from the first `starts_each` starts: arrays (n, starts_each)."""
             which, start = np.divmod(np.arange(len(vectors) * starts_each), starts_each)
             chosen = jax.tree.map(lambda column: column[which], controllers)
             drawn = jax.tree.map(lambda column: column[start], (starts, plants))
-            found = _in_blocks(run, block, chosen, *drawn)
+            found = descent.in_blocks(run, block, chosen, *drawn)
             return jax.tree.map(lambda column: column.reshape(len(vectors), starts_each), found)
 
         runs = over(self.evaluated if final else self.validated, count)
@@ -305,16 +300,6 @@ class _Tuner:
         return found
 
 
-def _in_blocks(function: Any, block: int, *trees: Any) -> Any:
-    """`function` of (n, ...) arrays, as NumPy arrays, by blocks of one size, so that it is compiled once."""
-    count = jax.tree.leaves(trees)[0].shape[0]
-    parts = []
-    for begin in range(0, count, block):
-        members = np.minimum(np.arange(begin, begin + block), count - 1)
-        parts.append(jax.tree.map(np.asarray, function(*jax.tree.map(operator.itemgetter(members), trees))))
-    return jax.tree.map(lambda *columns: np.concatenate(columns)[:count], *parts)
-
-
 def _watched(count: int) -> int:
     """Of so many starts, how many are run with located switching too: an eighth, as each costs far more."""
     return count // 8
@@ -333,8 +318,3 @@ def fastest_pole_bound(A: jax.Array) -> jax.Array:
         logarithm = logarithm + jnp.log(size) / 2**doubling
         A = (A / size) @ (A / size)
     return jnp.exp(logarithm)
-
-
-def _seed(plan: Plan, purpose: int, step: int) -> int:
-    """A seed that no person types in: of starts that no evaluation uses."""
-    return 2**32 + int(np.random.SeedSequence([plan.seed, purpose, step]).generate_state(1)[0])

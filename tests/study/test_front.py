@@ -10,8 +10,10 @@ from cpjax import paper
 from cpjax.errors import InputError
 from cpjax.numeric.pareto import nondominated
 from cpjax.sim.metrics import TimeOutside
-from cpjax.study.front import COSTS, BoundedTime, FrontPlan, Travel, _fastest, _Judged, _layers, trace_fronts
-from cpjax.tune.objective import Effort, Jerkiness, Unfinished
+from cpjax.study.front import trace_fronts
+from cpjax.study.front_judge import Judged, layers
+from cpjax.study.front_plan import COSTS, FrontPlan
+from cpjax.tune.objective import BoundedTime, Effort, Jerkiness, Travel, Unfinished
 from cpjax.tune.starting import beginning
 
 PLANT = paper.appendix_plant()
@@ -32,23 +34,23 @@ def test_what_exceeds_its_bound_counts_relative_to_it():
 def judged(rows):
     success, time, effort = np.array(rows).T
     costs = np.stack([effort, np.ones(len(rows)), np.ones(len(rows))], axis=1)
-    return _Judged(np.arange(len(rows), dtype=float)[:, None], success, time, costs)
+    return Judged(np.arange(len(rows), dtype=float)[:, None], success, time, costs)
 
 
 def test_the_fastest_within_a_bound_never_fails_if_any_does_not():
     met = judged([(1.0, 3.0, 10.0), (1.0, 2.0, 20.0), (0.9, 1.0, 5.0), (1.0, 4.0, 8.0)])
-    assert _fastest(met, "effort", 15.0)[0] == 0.0
-    assert _fastest(met, "effort", 25.0) == (1.0, 2.0)
-    vector, time = _fastest(met, "effort", 7.0)
+    assert met.fastest("effort", 15.0)[0] == 0.0
+    assert met.fastest("effort", 25.0) == (1.0, 2.0)
+    vector, time = met.fastest("effort", 7.0)
     assert (vector, time) == (3.0, math.inf)  # none keeps to it: the cheapest of those that never fail
 
 
 def test_layers_begin_with_what_no_other_beats_and_end_with_what_is_finite():
     points = np.array([[9.0, 90.0], [1.0, 5.0], [2.0, 4.0], [3.0, 6.0], [np.inf, np.inf]])
-    assert _layers(points, 2).tolist() == [1, 2]
-    assert _layers(points, 3).tolist() == [1, 2, 3]
-    assert sorted(_layers(points, 100)) == [0, 1, 2, 3]
-    assert _layers(points[4:], 2).tolist() == [0]
+    assert layers(points, 2).tolist() == [1, 2]
+    assert layers(points, 3).tolist() == [1, 2, 3]
+    assert sorted(layers(points, 100)) == [0, 1, 2, 3]
+    assert layers(points[4:], 2).tolist() == [0]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,158 @@
+"""What many controllers are worth, and which of them to go on from: the judge of a search for trade-off fronts."""
+
+import dataclasses
+import math
+import operator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cpjax import paper
+from cpjax.controllers import EnergySwingUp
+from cpjax.numeric.pareto import nondominated
+from cpjax.plant import CartPole
+from cpjax.sim.metrics import Metrics
+from cpjax.sim.sweep import sweep
+from cpjax.starts import sample_starts
+from cpjax.state import State
+from cpjax.study.front_plan import COSTS, FrontPlan
+from cpjax.tune.descent import in_blocks, seed_of
+from cpjax.tune.parameters import FreeParameters, free_parameters
+from cpjax.tune.starting import beginning
+
+Numbers = np.ndarray[Any, Any]
+
+SCREEN, BATCH, JUDGE, SEMIFINAL, FINAL, CANDIDATES = range(6)
+"""What random numbers are for."""
+
+_RUNS, _CONTROLLERS = 2048, 64  # simulated, and designed, at a time
+
+
+class Judged(NamedTuple):
+    """Controllers and what they were found to be worth: arrays with a leading axis of their number."""
+
+    vectors: Numbers
+    success: Numbers
+    time: Numbers
+    costs: Numbers
+    """(n, number of `COSTS`)."""
+
+    def points(self, cost: str, success: float) -> Numbers:
+        """Settling time and cost (n, 2); infinite for those that settle from a smaller share of the starts."""
+        found = np.stack([self.time, self.costs[:, COSTS.index(cost)]], axis=1)
+        found[self.success < success] = np.inf
+        return found
+
+    def fastest(self, cost: str, bound: float) -> tuple[Numbers, float]:
+        """Of the controllers that fail least, the fastest that keeps to the bound, and its time; if there is none, the
+        cheapest, and infinity.
+        """
+        time, spent = self.points(cost, np.max(self.success)).T
+        within = np.where(spent <= bound, time, np.inf)
+        best = int(np.argmin(within))
+        if np.isfinite(within[best]):
+            return self.vectors[best], float(time[best])
+        return self.vectors[int(np.argmin(spent))], math.inf
+
+    def ladder(self, cost: str, plan: FrontPlan) -> Numbers:
+        """Bounds of a cost (bounds + 1,)."""
+        points = self.points(cost, np.max(self.success))
+        points = points[np.isfinite(points[:, 0])]
+        if not len(points):
+            return np.full(plan.bounds + 1, np.inf)
+        fastest = points[np.argmin(points[:, 0]), 1]
+        return np.append(np.geomspace(plan.lowest * np.min(points[:, 1]), fastest, plan.bounds), np.inf)
+
+
+class Judge:
+    """Builds one design's controllers of their free parameters, at any supply, and counts what it costs to judge them.
+
+    Attributes:
+      free: what may change, about the bland start.
+      steps: Runge-Kutta steps simulated so far.
+    """
+
+    def __init__(self, plant: CartPole, design: paper.Design, plan: FrontPlan) -> None:
+        self._plant, self._design, self._plan = plant, design, plan
+        self.free = free_parameters(beginning("bland", design, plant))
+        self.steps = 0
+        self._built = jax.jit(jax.vmap(lambda vector, supply: self.free_at(supply).build(vector)))
+
+    def plant_at(self, supply: Any) -> CartPole:
+        """The plant at a supply [V]."""
+        return dataclasses.replace(self._plant, motor=dataclasses.replace(self._plant.motor, voltage_limit=supply))
+
+    def free_at(self, supply: Any) -> FreeParameters:
+        """The free parameters of controllers whose law knows this supply [V]."""
+        controller = self.free.controller
+        law = controller.swing_up
+        assert isinstance(law, EnergySwingUp)
+        law = dataclasses.replace(law, model=self.plant_at(supply))
+        return dataclasses.replace(self.free, controller=dataclasses.replace(controller, swing_up=law))
+
+    def starts(self, count: int, purpose: int, number: int = 0) -> State:
+        """Starts that no person's seed names."""
+        seed = seed_of(self._plan.seed, purpose, number)
+        return sample_starts("hanging", count, seed=seed, dtype=np.dtype(jnp.result_type(float)))
+
+    def judge(self, vectors: Numbers, supply: float, count: int, purpose: int) -> Judged:
+        """Controllers (n, d) by the protocol's metrics from so many starts, all the same."""
+        plan, plant, starts = self._plan, self.plant_at(supply), self.starts(count, purpose)
+        dt = plan.final_dt if purpose in (SEMIFINAL, FINAL) else plan.judging_dt
+        controllers = in_blocks(self._built, _CONTROLLERS, vectors, np.full(len(vectors), supply, vectors.dtype))
+
+        def run(which: Numbers, start: Numbers) -> Metrics:
+            found: Metrics = sweep(
+                plant,
+                jax.tree.map(operator.itemgetter(which), controllers),
+                jax.tree.map(operator.itemgetter(start), starts),
+                duration=plan.horizon,
+                dt=dt,
+                clock="sampled",
+            )
+            return found
+
+        metrics = in_blocks(run, _RUNS, *np.divmod(np.arange(len(vectors) * count), count))
+        self.steps += len(vectors) * count * round(plan.horizon / dt)
+        table = jax.tree.map(lambda column: column.astype(float).reshape(-1, count), metrics)
+        good = table.success > 0.0
+        total = np.sum(good, axis=1)
+
+        def mean(column: Numbers) -> Numbers:
+            summed = np.sum(np.where(good, column, 0.0), axis=1)
+            return np.where(total > 0, summed / np.maximum(total, 1), np.inf)
+
+        costs = np.stack([mean(getattr(table, cost)) for cost in COSTS], axis=1)
+        return Judged(vectors, total / count, mean(table.settling_time), costs)
+
+    def begin(self, supply: float, count: int, number: int) -> Judged:
+        """The bland start and `count` random candidates from ranges that suit the supply; the better ones of each cost
+        judged on more starts."""
+        plan = self._plan
+        random = np.random.default_rng([plan.seed, CANDIDATES, number])
+        free = free_parameters(beginning("bland", self._design, self.plant_at(supply)))
+        bland = np.asarray(self.free.start())[None]
+        drawn = np.concatenate([bland, free.draw(random, count).astype(bland.dtype)])
+        screened = self.judge(drawn, supply, plan.screening, SCREEN)
+        better: set[int] = {0}
+        for cost in COSTS:
+            better.update(map(int, layers(screened.points(cost, np.max(screened.success)), 4 * plan.bounds)))
+        return self.judge(screened.vectors[sorted(better)], supply, plan.judging, JUDGE)
+
+
+def layers(points: Numbers, least: int) -> Numbers:
+    """Indices of the points (n, 2) that no other beats, then of those that only they beat, and so on, until there are
+    `least` or no more that are finite; the first point if none is.
+    """
+    left, chosen = np.array(points), np.zeros(0, int)
+    while len(chosen) < least and len(layer := nondominated(left)):
+        chosen = np.concatenate([chosen, layer])
+        left[layer] = np.inf
+    return chosen if len(chosen) else np.zeros(1, int)
+
+
+def together(parts: list[Judged]) -> Judged:
+    """All controllers of several lists."""
+    return Judged(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))

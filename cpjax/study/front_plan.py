@@ -1,0 +1,77 @@
+"""How trade-off fronts are traced: what is traded, and how much work goes into it."""
+
+import dataclasses
+import math
+
+from cpjax.errors import InputError
+
+COSTS = ("effort", "cart_travel", "voltage_variation")
+"""Of `Metrics`, against the settling time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FrontPlan:
+    """How fronts are traced.
+
+    Attributes:
+      seed: of everything random. Starts are never those that a seed names for `cpjax.sample_starts`.
+      bounds: of the ladder, for each cost and supply; from `lowest` times the least cost among the candidates
+        geometrically to the cost of the fastest; and one more tuning without a bound.
+      lowest: see there.
+      penalty: what a cost of twice its bound counts [s].
+      candidates: random controllers to begin with.
+      screening: starts by which they are judged.
+      steps: of the optimiser.
+      batch: starts of a step.
+      learning_rate: Adam's.
+      clip: a start's gradient is shortened to this many times the batch's median norm.
+      duration: of the tunings' rollouts [s].
+      dt: their step [s].
+      spare_rate: steps beyond those in each second, for crossings [1/s].
+      width: of the target [rad and m].
+      judge_every: steps after which all controllers are judged, and exchanged.
+      judging: starts by which they are.
+      semifinal: starts by which the best of a front are compared once more: who was lucky with few is not with many.
+      final: unseen starts that the points of a front are measured from.
+      horizon: of all runs that judge [s].
+      judging_dt: step and control period of screening and judging [s].
+      final_dt: of semifinal and final [s].
+      success: share of the starts that a point must settle from in both.
+    """
+
+    seed: int = 1
+    bounds: int = 31
+    lowest: float = 0.85
+    penalty: float = 10.0
+    candidates: int = 4096
+    screening: int = 16
+    steps: int = 100
+    batch: int = 8
+    learning_rate: float = 0.04
+    clip: float = 2.0
+    duration: float = 8.0
+    dt: float = 0.02
+    spare_rate: float = 20.0
+    width: float = 0.05
+    judge_every: int = 10
+    judging: int = 96
+    semifinal: int = 256
+    final: int = 1024
+    horizon: float = 20.0
+    judging_dt: float = 0.004
+    final_dt: float = 0.002
+    success: float = 0.99
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.type in (int, "int"):
+                least = 0 if field.name in ("seed", "steps") else 1
+                if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                    raise InputError(field.name, value, f"a whole number, at least {least}")
+            elif isinstance(value, (bool, str)) or not 0.0 < value < math.inf:
+                raise InputError(field.name, value, "a finite number above 0")
+        if self.lowest >= 1.0:
+            raise InputError("lowest", self.lowest, "above 0 and below 1")
+        if self.success > 1.0:
+            raise InputError("success", self.success, "above 0 and at most 1")
