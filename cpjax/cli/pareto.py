@@ -122,6 +122,7 @@ def traced(
                     "success": front.success.tolist(),
                     "vectors": front.vectors.tolist(),
                     "volume": front.volume,
+                    "best_success": front.best_success,
                 }
                 for kind, front in (("traced", fronts.traced[supply, cost]), ("random", fronts.random[supply, cost]))
             },
@@ -180,7 +181,7 @@ def table(found: Found) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
             design,
             row["cost"],
             f"{row['supply']:g}",
-            str(len(row["traced"]["points"])),
+            str(len(row["traced"]["points"])) if row["traced"]["points"] else _none(row["traced"]),
             f"{row['traced']['points'][0][0]:.3f}" if row["traced"]["points"] else "-",
             f"{row['traced']['points'][-1][1]:.4g}" if row["traced"]["points"] else "-",
             f"{row['traced']['volume']:.4g}",
@@ -202,6 +203,11 @@ def costs(found: Found) -> list[str]:
             f"{steps['random']} of values by the random search; {found[design]['seconds']:.0f} s"
         )
     return sentences
+
+
+def _none(front: dict[str, Any]) -> str:
+    """Instead of a number of points."""
+    return f"none (at best {100 * front['best_success']:.0f} % settle)"
 
 
 def _part(out: Path, design: str) -> Path:

@@ -85,6 +85,10 @@ def by_supply(curves: Mapping[float, Mapping[str, Curve]]) -> Figure:
     for axes, (supply, designs) in zip(panels, sorted(curves.items()), strict=True):
         for design, curve in designs.items():
             _draw(axes, design, curve)
+        if not any(len(curve.traced) + len(curve.random) for curve in designs.values()):
+            axes.text(
+                0.5, 0.5, "no controller found\nthat settles from enough starts", ha="center", transform=axes.transAxes
+            )
         axes.set_title(f"{supply:g} V\n{_verdict(designs)}", fontsize="medium")
         axes.set_xlabel("mean settling time [s]")
         axes.grid(alpha=0.3, which="both")

@@ -51,12 +51,14 @@ class Front:
       success: share of those starts (n,).
       vectors: the controllers' free parameters (n, d).
       volume: the hypervolume up to the reference.
+      best_success: the greatest share of the starts from which any controller met settled, when they were first judged.
     """
 
     points: Numbers
     success: Numbers
     vectors: Numbers
     volume: float
+    best_success: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,10 +111,13 @@ def trace_fronts(
     met = tracer.trace(begun, lanes, report)
     values, gradients = judge.steps, tracer.steps
     report(plan.steps, plan.steps, "random search of the same cost")
-    share = (values + GRADIENT_STEP * gradients) / len(everywhere)
-    each = plan.screening * round(plan.horizon / plan.judging_dt)
+    budget = values + GRADIENT_STEP * gradients
+    # As many as the tracing's will be judged a second time; the rest goes into screening.
+    run = round(plan.horizon / plan.judging_dt)
+    budget -= run * plan.judging * sum(len(one.vectors) for one in begun.values())
+    count = max(1, int(budget / (run * plan.screening * len(everywhere))))
     judge.steps = 0
-    drawn = {supply: judge.begin(supply, int(share / each), 1) for supply in everywhere}
+    drawn = {supply: judge.begin(supply, count, 1) for supply in everywhere}
     steps = {"values": values, "gradients": gradients, "random": judge.steps}
 
     def fronts(found: dict[float, Judged]) -> dict[Lane, Front]:
@@ -123,15 +128,21 @@ def trace_fronts(
 
 def _front(judge: Judge, plan: FrontPlan, met: Judged, supply: float, cost: str, reference: Numbers) -> Front:
     """Of all controllers met, those that no other beats, measured once more from unseen starts."""
-    chosen = met.vectors[layers(met.points(cost, 1.0), 3 * plan.bounds)]
-    for count, purpose in ((plan.semifinal, SEMIFINAL), (plan.final, FINAL)):
-        judged = judge.judge(chosen, supply, count, purpose)
-        points = judged.points(cost, plan.success)
-        kept = nondominated(points)
-        chosen = chosen[kept]
-        if not len(kept):
-            break
-    return Front(points[kept], judged.success[kept], chosen, hypervolume(points[kept], reference))
+    # Few starts say little about one failure in a hundred: who failed a few of them may run in the semifinal.
+    lenient = 1.0 - 3.0 * (1.0 - plan.success)
+    chosen = np.unique(np.concatenate([layers(met.points(cost, share), 3 * plan.bounds) for share in (1.0, lenient)]))
+    semifinal = judge.judge(met.vectors[chosen], supply, plan.semifinal, SEMIFINAL)
+    chosen = chosen[layers(semifinal.points(cost, plan.success), plan.bounds)]
+    final = judge.judge(met.vectors[chosen], supply, plan.final, FINAL)
+    points = final.points(cost, plan.success)
+    kept = nondominated(points)
+    return Front(
+        points[kept],
+        final.success[kept],
+        final.vectors[kept],
+        hypervolume(points[kept], reference),
+        float(np.max(met.success)),
+    )
 
 
 class _Aim(NamedTuple):
@@ -185,7 +196,9 @@ class _Tracer:
                     rows = np.flatnonzero(supplies == supply)
                     judged = self._judge.judge(np.asarray(vectors)[rows], supply, plan.judging, JUDGE)
                     met[supply] = together([met[supply], judged])
-                    kept = (judged.success == 1.0) & np.all(judged.costs <= bounds[rows], axis=1)
+                    kept = (judged.success >= np.max(met[supply].success)) & np.all(
+                        judged.costs <= bounds[rows], axis=1
+                    )
                     times[rows] = np.where(kept, judged.time, np.inf)
                 better = [met[supply].fastest(cost, bound) for supply, cost, bound in jobs]
                 jump = np.array([time < 0.98 * now for (_, time), now in zip(better, times, strict=True)])

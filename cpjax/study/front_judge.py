@@ -134,7 +134,9 @@ class Judge:
         random = np.random.default_rng([plan.seed, CANDIDATES, number])
         free = free_parameters(beginning("bland", self._design, self.plant_at(supply)))
         bland = np.asarray(self.free.start())[None]
-        drawn = np.concatenate([bland, free.draw(random, count).astype(bland.dtype)])
+        gentle = count // 2  # who pumps gently, in more swings, needs less room
+        draws = free.draw(random, count - gentle), free.draw(random, gentle, short_track=True)
+        drawn = np.concatenate([bland, *draws]).astype(bland.dtype)
         screened = self.judge(drawn, supply, plan.screening, SCREEN)
         better: set[int] = {0}
         for cost in COSTS:
