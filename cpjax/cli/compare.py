@@ -1,7 +1,7 @@
 """`cpjax compare`: the paper's gains against tuned ones, as a table, pictures and JSON."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid, LqrWeights, PoleFactors
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
-from cpjax.sim.rollout import Trajectory, rollout
+from cpjax.sim.rollout import rollout
 from cpjax.state import NAMES, State
 from cpjax.study.comparison import Compared, best, compare, document, entries
 from cpjax.study.reproduction import DESIGNS, Setting
@@ -32,7 +32,7 @@ def add_command(commands: Any) -> None:
     """Declares the command."""
     text = (
         "The paper's gains, as printed and as computed, with its law as printed and as corrected, against tuned "
-        "controllers, over the same starts. Writes compare.json, responses.png and by_start.png."
+        "controllers, over the same starts. Writes compare.json, responses.png, phase.png and by_start.png."
     )
     parser = commands.add_parser("compare", help="the paper's gains against tuned ones", description=text)
     add_options(parser, OPTIONS, out="out/compare")
@@ -68,34 +68,33 @@ def compared(
     chosen = entries(plant, tuned)
     with progress("compare") as report:
         starts, results = compare(plant, chosen, setting, track_limit=track_limit, progress=report)
-    io.write_json(out / "compare.json", document(plant, results, setting, track_limit=track_limit))
-
-    from cpjax.show.comparison import by_start, responses
-    from cpjax.show.figures import save_figure
-
-    runs = representative_runs(plant, starts, results, setting)
-    until = min(8.0, setting.duration)
-    save_figure(out / "responses.png", responses(runs, until, float(plant.motor.voltage_limit)))
-    save_figure(out / "by_start.png", by_start(starts, results))
-    return results
-
-
-def representative_runs(
-    plant: CartPole, starts: State, results: list[Compared], setting: Setting
-) -> dict[tuple[str, str], Trajectory]:
-    """From the first start that all four of the shown controllers catch, or else from the first one."""
-    shown = {
+    best_ones: dict[tuple[str, str], Compared] = {
         (kind, design): best(results, design, tuned=kind == "tuned")
         for kind in ("paper", "tuned")
         for design in DESIGNS
     }
-    caught = np.all([np.asarray(one.metrics.success) for one in shown.values()], axis=0)
+    start = representative_start(starts, list(best_ones.values()))
+    described = document(plant, results, setting, track_limit=track_limit, shown_start=io.encode(start))
+    io.write_json(out / "compare.json", described)
+
+    from cpjax.show.comparison import by_start, phase_portraits, responses
+    from cpjax.show.figures import save_figure
+
+    how: dict[str, Any] = {"duration": setting.duration, "dt": setting.dt, "clock": "sampled"}
+    shown = {key: (one, rollout(plant, one.entry.controller, start, **how)) for key, one in best_ones.items()}
+    times = [float(run.metrics.settling_time) for _, run in shown.values()]
+    until = min(setting.duration, 1.1 * max((time for time in times if np.isfinite(time)), default=setting.duration))
+    save_figure(out / "responses.png", responses(shown, until, float(plant.motor.voltage_limit)))
+    save_figure(out / "phase.png", phase_portraits(plant, shown))
+    save_figure(out / "by_start.png", by_start(starts, results))
+    return results
+
+
+def representative_start(starts: State, shown: Sequence[Compared]) -> State:
+    """The first start that all of these catch, or else the first one."""
+    caught = np.all([np.asarray(one.metrics.success) for one in shown], axis=0)
     index = int(np.argmax(caught))
-    start = State(*(float(np.asarray(getattr(starts, name))[index]) for name in NAMES))
-    return {
-        key: rollout(plant, one.entry.controller, start, duration=setting.duration, dt=setting.dt, clock="sampled")
-        for key, one in shown.items()
-    }
+    return State(*(float(np.asarray(getattr(starts, name))[index]) for name in NAMES))
 
 
 def print_results(results: list[Compared]) -> None:

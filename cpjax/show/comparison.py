@@ -1,20 +1,28 @@
 """A comparison of controllers as a table and pictures."""
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
+import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
+from cpjax.controllers import REGULATE, SWING_UP, Hybrid
 from cpjax.numeric.statistics import two_proportion_p_value
 from cpjax.numeric.trigonometry import wrap_angle
+from cpjax.plant import CartPole
 from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES
 from cpjax.sim.rollout import Trajectory
 from cpjax.state import State
 from cpjax.study.comparison import Compared, best
 from cpjax.study.reproduction import DESIGNS
 
+_GATE = "#E69F00"
 HEADER = (
     "controller",
     "regulator",
@@ -76,19 +84,24 @@ def _answer(results: Sequence[Compared], *, tuned: bool) -> str:
     return f"{kind}: {words(a)}; {words(b)} ({verdict} in success)."
 
 
-def responses(runs: Mapping[tuple[str, str], Trajectory], until: float, limit: float) -> Figure:
+Shown: TypeAlias = Mapping[tuple[str, str], tuple[Compared, Trajectory]]
+"""By "paper" or "tuned" and design: a controller, and its run from the one start that is shown."""
+
+
+def responses(shown: Shown, until: float, limit: float) -> Figure:
     """Angle, cart and voltage of the paper's and the tuned controllers from one start, the designs side by side."""
     figure = Figure(figsize=(12, 8), layout="constrained")
     axes = figure.subplots(3, 2, sharex=True, sharey="row")
     for column, design in enumerate(DESIGNS):
         for kind, style in (("paper", "--"), ("tuned", "-")):
-            run = runs[kind, design]
+            one, run = shown[kind, design]
             time = np.asarray(run.time)
             colour = DESIGN_COLOURS[design] if kind == "tuned" else "#777777"
             series = (wrapped(run.state), np.asarray(run.state.x), np.asarray(run.voltage))
             for row, values in enumerate(series):
-                axes[row, column].plot(time, values, style, color=colour, label=kind, linewidth=1.3)
-        axes[0, column].set_title(DESIGN_NAMES[design])
+                axes[row, column].plot(time, values, style, color=colour, label=_label(one), linewidth=1.3)
+        numbers = {"lqr": "3 and 5", "placement": "4 and 6"}[design]
+        axes[0, column].set_title(f"{DESIGN_NAMES[design]} (the paper's Figures {numbers})")
         axes[2, column].set_xlabel("time [s]")
         axes[2, column].set_xlim(0, until)
         for sign in (-1, 1):
@@ -100,6 +113,62 @@ def responses(runs: Mapping[tuple[str, str], Trajectory], until: float, limit: f
         axes[row, 0].set_ylabel(label)
     axes[1, 0].set_ylim(-2.0, 2.0)
     return figure
+
+
+def phase_portraits(plant: CartPole, shown: Shown) -> Figure:
+    """Angle and rate of the whole runs, over the pendulum's energy and each controller's gate."""
+    figure = Figure(figsize=(12, 9), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True, sharey=True)
+    fastest = max(float(np.max(np.abs(np.asarray(run.state.theta_dot)))) for _, run in shown.values())
+    per_lift = 4.0 * float(plant.pole_mass) * float(plant.gravity) * float(plant.pole_length)
+    whole_turn = math.sqrt(per_lift / float(plant.pivot_inertia))  # hanging, with the energy of upright
+    high = min(1.1 * max(fastest, whole_turn), 2.5 * whole_turn)  # a pole that spins leaves the view
+    for column, design in enumerate(DESIGNS):
+        for row, kind in enumerate(("paper", "tuned")):
+            panel, (one, run) = axes[row, column], shown[kind, design]
+            _energy_and_gate(panel, plant, one.entry.controller, high)
+            theta, rate = wrapped(run.state), np.asarray(run.state.theta_dot)
+            regulating = np.asarray(run.mode) == REGULATE
+            for part, width in ((~regulating, 0.9), (regulating, 2.4)):
+                path = np.where(part, theta, np.nan), np.where(part, rate, np.nan)
+                panel.plot(*path, color=DESIGN_COLOURS[design], linewidth=width)
+            panel.plot(theta[:1], rate[:1], "o", color="black", markersize=5)
+            panel.set_ylim(-high, high)
+            panel.set_title(f"{DESIGN_NAMES[design]}: {_label(one)}", fontsize="medium")
+        axes[1, column].set_xlabel(r"$\theta$ from upright [rad]")
+    for row in range(2):
+        axes[row, 0].set_ylabel(r"$\dot\theta$ [rad/s]")
+    legend = {
+        "swing-up acts": Line2D([], [], color="0.35", linewidth=0.9),
+        "regulator acts": Line2D([], [], color="0.35", linewidth=2.4),
+        "start": Line2D([], [], color="black", marker="o", linestyle="none", markersize=5),
+        "energy of upright": Line2D([], [], color="black", linewidth=1.3, linestyle="--"),
+        "other energies, a fifth of the lift apart": Line2D([], [], color="0.75", linewidth=0.8),
+        "gate": Patch(facecolor=_GATE, alpha=0.25),
+    }
+    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=6, frameon=False)
+    return figure
+
+
+def _label(one: Compared) -> str:
+    return one.entry.name if one.entry.gains == "tuned" else f"{one.entry.name}, {one.entry.gains} gains"
+
+
+def _energy_and_gate(axes: Axes, plant: CartPole, controller: Hybrid, high: float) -> None:
+    """With the cart at rest in the middle, from hanging to hanging."""
+    theta, rate = np.linspace(-np.pi, np.pi, 401), np.linspace(-high, high, 401)
+    grid = np.meshgrid(theta, rate)
+    state = State(np.zeros_like(grid[0]), np.zeros_like(grid[0]), *grid)
+    lift = 2.0 * plant.pole_mass * plant.gravity * plant.pole_length
+    energy = np.asarray(plant.pendulum_energy(state)) / float(lift)
+    levels = np.arange(-0.8, float(energy.max()), 0.2)
+    axes.contour(
+        theta, rate, energy, levels=levels[np.abs(levels) > 0.1], colors="0.75", linewidths=0.8, linestyles="-"
+    )
+    axes.contour(theta, rate, energy, levels=[0.0], colors="black", linewidths=1.3, linestyles="--")
+    margin = np.asarray(controller.gate.margin(state, jnp.int32(SWING_UP)))
+    if margin.max() > 0.0:
+        axes.contourf(theta, rate, margin, levels=[0.0, float(margin.max())], colors=[_GATE], alpha=0.25)
 
 
 def wrapped(state: State) -> np.ndarray[Any, Any]:
@@ -122,7 +191,7 @@ def by_start(starts: State, results: Sequence[Compared]) -> Figure:
             time = np.asarray(one.metrics.settling_time)
             drawn = panel.scatter(theta[good], rate[good], c=time[good], s=5, cmap="viridis", norm=LogNorm(1.5, 15.0))
             panel.plot(theta[~good], rate[~good], "x", color="#D55E00", markersize=3, alpha=0.6)
-            panel.set_title(f"{one.entry.name}: {DESIGN_NAMES[design]}, {one.entry.gains} gains", fontsize="medium")
+            panel.set_title(f"{DESIGN_NAMES[design]}: {_label(one)}", fontsize="medium")
         axes[1, column].set_xlabel(r"$\theta$ at the start [rad]")
     for row in range(2):
         axes[row, 0].set_ylabel(r"$\dot\theta$ at the start [rad/s]")
