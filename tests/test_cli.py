@@ -32,7 +32,7 @@ from cpjax import (
     rollout,
     sample_starts,
 )
-from cpjax.cli import main
+from cpjax.cli import main, report_sections
 from cpjax.cli.basin import CONTROLLERS, file_of
 from cpjax.cli.reproduce import print_rows
 from cpjax.cli.swingup import OPTIONS
@@ -760,15 +760,16 @@ def report(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", buffers.StringIO())
         patch.setattr(sys, "stderr", buffers.StringIO())
-        code = main(["report", "--out", str(folder), *EVALUATION, "--cells", "0", "--fronts", "none"])
+        code = main(["report", "--out", str(folder), *EVALUATION, "--cells", "0", "--studies", "none"])
     text = (folder / "report.html").read_text(encoding="utf-8")
     return SimpleNamespace(folder=folder, code=code, text=text, page=Page(text))
 
 
 def test_a_report_writes_its_page_beside_the_rows_and_pictures(report):
     assert report.code == 0
-    data = {"reproduction.json", "designs.json", "audit_gains.json", "compare.json", "responses.png", "by_start.png"}
-    assert {p.name for p in report.folder.iterdir()} == {"report.html", "audit_gains.png", *data, *FIGURES}
+    data = {"reproduction.json", "designs.json", "audit_gains.json", "compare.json"}
+    pictures = {"audit_gains.png", "responses.png", "phase.png", "by_start.png", *FIGURES}
+    assert {p.name for p in report.folder.iterdir()} == {"report.html", *data, *pictures}
 
 
 def test_a_reports_rows_are_those_of_the_reproduction(report, reproduced):
@@ -792,7 +793,7 @@ def test_a_report_is_one_valid_page_that_loads_nothing_from_elsewhere(report):
 
 def test_every_picture_of_a_report_is_inside_it_and_described(report):
     pictures = [attributes for tag, attributes in report.page.tags if tag == "img"]
-    assert len(pictures) == len(FIGURES) + 3  # the audit's, and the comparison's two
+    assert len(pictures) == len(FIGURES) + 4  # the audit's, and the comparison's three
     for picture in pictures:
         assert picture["src"].startswith("data:image/png;base64,iVBOR")
         assert len(picture["alt"]) > 20
@@ -856,12 +857,22 @@ def test_the_comparison_in_a_report_is_that_of_its_json(report):
 
 
 @pytest.mark.slow
-def test_basins_and_fronts_in_a_report_are_those_of_its_json(command, tmp_path, monkeypatch):
-    monkeypatch.setattr(cpjax.cli.report, "_forensics", lambda page, given: None)
-    small = {"bounds": 2, "candidates": 64, "steps": 2, "semifinal": 16, "final": 16}
-    monkeypatch.setattr(cpjax.cli.report, "_QUICK", small)
+def test_the_studies_in_a_report_are_those_of_its_json(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(report_sections, "forensics", lambda page, given: None)
+    fronts = {"bounds": 2, "candidates": 64, "steps": 2, "semifinal": 16, "final": 16}
+    monkeypatch.setattr(report_sections, "QUICK_FRONTS", fronts)
+    tuning = {"candidates": 15, "restarts": 2, "batch": 2, "steps": 2, "final": 64}
+    monkeypatch.setattr(report_sections, "QUICK_TUNING", tuning)
     assert command("report", "--out", tmp_path, *EVALUATION, "--cells", "8").code == 0
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    sources = [attributes["src"][:15] for tag, attributes in page.tags if tag == "img"]
+    assert sources.count("data:image/gif;") == 1
+    audit = document(tmp_path, "audit_gradients.json")
+    assert [cells[0] for cells in page.rows if cells[0] in audit["names"]] == audit["names"]
+    for design, name in cpjax.show.figures.DESIGN_NAMES.items():
+        found = document(tmp_path / f"tune-{design}", "tune.json")
+        expected = [name, f"{100 * found['success_rate']:.2f}", f"{found['settling_time']:.3f}"]
+        assert expected in [cells[:3] for cells in page.rows]
     basins = document(tmp_path, "basin.json")["basins"]
     shown = [cells for cells in page.rows if cells and cells[0] in CONTROLLERS]
     assert [cells[0] for cells in shown] == list(CONTROLLERS)
@@ -876,15 +887,15 @@ def test_basins_and_fronts_in_a_report_are_those_of_its_json(command, tmp_path, 
 def test_a_report_names_its_setting_and_the_command_that_makes_it_again(report):
     text = "".join(report.page.words)
     assert "8 starts from the set hanging (seed 1), 12 s each, RK4 with a step of 10 ms" in text
-    assert "cpjax report --starts hanging --count 8 --seed 1 --duration 12 --dt 0.01 --cells 0 --fronts none" in text
+    assert "cpjax report --starts hanging --count 8 --seed 1 --duration 12 --dt 0.01 --cells 0 --studies none" in text
 
 
 @pytest.mark.slow
 def test_a_report_of_odd_numbers_gives_the_command_with_all_their_digits(command, tmp_path, no_pictures, monkeypatch):
     monkeypatch.setattr(reproduction, "evaluate", fake_evaluate)
-    for section in ("_designs", "_forensics"):
-        monkeypatch.setattr(cpjax.cli.report, section, lambda page, given: None)
-    few = ("--count", "3", "--cells", "0", "--fronts", "none")
+    for section in ("designs", "forensics"):
+        monkeypatch.setattr(report_sections, section, lambda page, given: None)
+    few = ("--count", "3", "--cells", "0", "--studies", "none")
     command("report", "--out", tmp_path, *few, "--duration", "1.23456789", "--dt", "0.00123456789")
     text = "".join(Page((tmp_path / "report.html").read_text(encoding="utf-8")).words)
     assert "--duration 1.23456789 --dt 0.00123456789" in text

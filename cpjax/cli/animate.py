@@ -1,6 +1,8 @@
 """`cpjax animate`: one run, or several side by side, as a moving picture."""
 
 import argparse
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,9 @@ from cpjax.cli.options import (
 from cpjax.cli.progress import progress
 from cpjax.controllers import Hybrid, PoleFactors
 from cpjax.errors import InputError
-from cpjax.sim.rollout import rollout
+from cpjax.plant import CartPole
+from cpjax.sim.rollout import Trajectory, rollout
+from cpjax.state import State
 
 CONTROLLERS = ("corrected/lqr", "tuned_lqr")
 _FORMATS = ("gif", "mp4", "html")
@@ -60,6 +64,25 @@ def run(given: argparse.Namespace) -> int:
         raise InputError("duration", chosen["duration"], "above 0 and at most 600 s")
     controllers = {name: named_hybrid(name, plant) for name in chosen["controllers"]}
     start = build_start(sections["start"], given.seed)
+    path, runs = animated(given.out, plant, controllers, start, chosen, seed=given.seed)
+    for name, one in runs.items():
+        time = float(one.metrics.settling_time)
+        print(f"{name}: " + (f"settles after {time:.2f} s" if np.isfinite(time) else "does not settle in this time"))
+    print(f"wrote {path} and animation.json")
+    return 0
+
+
+def animated(
+    out: Path,
+    plant: CartPole,
+    controllers: Mapping[str, Hybrid],
+    start: State,
+    chosen: Mapping[str, Any],
+    **others: Any,
+) -> tuple[Path, dict[str, Trajectory]]:
+    """The animation's file and the runs it shows, written with animation.json; `chosen` has format, duration and rate,
+    and the JSON has `others` too.
+    """
     dt = 0.002
     duration = dt * round(chosen["duration"] / dt)
     runs = {
@@ -76,13 +99,12 @@ def run(given: argparse.Namespace) -> int:
     if kind == "mp4" and encoder() is None:
         kind = "html"
         print("no ffmpeg: writing a page of HTML instead of an MP4")
-    path = given.out / f"animation.{kind}"
+    path = out / f"animation.{kind}"
     with progress("animate") as report:
         save_animation(path, scenes, duration=duration, rate=chosen["rate"], report=report)
     document = {
         "what": "runs shown by the animation beside this file",
         "versions": io.versions(),
-        "seed": given.seed,
         "start": io.encode(start),
         "plant": io.encode(plant),
         "file": path.name,
@@ -98,13 +120,10 @@ def run(given: argparse.Namespace) -> int:
             }
             for name, one in runs.items()
         },
+        **others,
     }
-    io.write_json(given.out / "animation.json", document)
-    for name, one in runs.items():
-        time = float(one.metrics.settling_time)
-        print(f"{name}: " + (f"settles after {time:.2f} s" if np.isfinite(time) else "does not settle in this time"))
-    print(f"wrote {path} and animation.json")
-    return 0
+    io.write_json(out / "animation.json", document)
+    return path, runs
 
 
 def _colour(name: str, controller: Hybrid) -> str:

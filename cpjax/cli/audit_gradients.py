@@ -1,6 +1,8 @@
 """`cpjax audit-gradients`: can gradients through this loop be trusted? A table, a picture and JSON."""
 
 import argparse
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from cpjax import io
@@ -15,8 +17,10 @@ from cpjax.cli.options import (
 )
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
+from cpjax.controllers import Hybrid
+from cpjax.plant import CartPole
 from cpjax.starts import START_SETS, sample_starts
-from cpjax.study.gradient_audit import audit_gradients, document
+from cpjax.study.gradient_audit import GradientAudit, audit_gradients, document
 from cpjax.study.named_parameters import parametrise
 
 OPTIONS = [
@@ -46,8 +50,25 @@ def run(given: argparse.Namespace) -> int:
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     controller = build_hybrid(sections["controller"], plant)
-    setting: dict[str, Any] = {"starts": "hanging", "count": 16, "duration": 4.0, "dt": 1e-3, **sections["audit"]}
-    starts = sample_starts(setting["starts"], setting["count"], seed=given.seed)
+    audit = audited(given.out, plant, controller, sections["audit"], given.seed)
+
+    from cpjax.show.gradients import TITLE, cells, findings, header
+
+    print_table(TITLE, header(audit), cells(audit), text_columns=1)
+    doubtful = [(str(i), kind, why) for i, (kind, why) in enumerate(audit.verdicts) if kind != "trustworthy"]
+    if doubtful:
+        print_table(
+            "Starts whose gradients are not to be trusted", ("start", "verdict", "why"), doubtful, text_columns=3
+        )
+    print(*findings(audit), sep="\n")
+    print(f"wrote {given.out / 'audit_gradients.json'} and {given.out / 'audit_gradients.png'}")
+    return 0
+
+
+def audited(out: Path, plant: CartPole, controller: Hybrid, setting: Mapping[str, Any], seed: int) -> GradientAudit:
+    """The audit, with its JSON and picture written; `setting` is by the options' keys, what is missing by default."""
+    setting = {"starts": "hanging", "count": 16, "duration": 4.0, "dt": 1e-3, **setting}
+    starts = sample_starts(setting["starts"], setting["count"], seed=seed)
     chosen = parametrise(plant, controller)
     with progress("audit-gradients") as report:
         audit = audit_gradients(
@@ -59,21 +80,12 @@ def run(given: argparse.Namespace) -> int:
             dt=setting["dt"],
             progress=report,
         )
-    path = given.out / "audit_gradients.json"
     loop = {"plant": io.encode(plant), "controller": io.encode(controller)}
-    io.write_json(path, document(audit, starts, seed=given.seed, setting=setting, parameters=chosen.parameters, **loop))
+    described = document(audit, starts, seed=seed, setting=setting, parameters=chosen.parameters, **loop)
+    io.write_json(out / "audit_gradients.json", described)
 
     from cpjax.show.figures import save_figure
-    from cpjax.show.gradients import cells, findings, header, picture
+    from cpjax.show.gradients import picture
 
-    save_figure(given.out / "audit_gradients.png", picture([audit]))
-    title = "Median relative error of derivatives, against finite differences (and how many have the wrong sign)"
-    print_table(title, header(audit), cells(audit), text_columns=1)
-    doubtful = [(str(i), kind, why) for i, (kind, why) in enumerate(audit.verdicts) if kind != "trustworthy"]
-    if doubtful:
-        print_table(
-            "Starts whose gradients are not to be trusted", ("start", "verdict", "why"), doubtful, text_columns=3
-        )
-    print(*findings(audit), sep="\n")
-    print(f"wrote {path} and {given.out / 'audit_gradients.png'}")
-    return 0
+    save_figure(out / "audit_gradients.png", picture([audit]))
+    return audit

@@ -3,7 +3,7 @@
 import argparse
 import dataclasses
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -13,11 +13,15 @@ from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
+from cpjax.plant import CartPole
 from cpjax.starts import START_SETS
 from cpjax.tune.objective import Goal
-from cpjax.tune.parameters import free_parameters
+from cpjax.tune.parameters import FreeParameters, free_parameters
 from cpjax.tune.plan import AGGREGATES, Plan
 from cpjax.tune.starting import GateKind, beginning
+
+if TYPE_CHECKING:  # with optax, which takes a while
+    from cpjax.tune.outcome import Tuning
 
 _DEFAULTS = {field.name: field.default for field in dataclasses.fields(Plan)}
 _PLANNED = {
@@ -80,9 +84,6 @@ def add_command(commands: Any) -> None:
 
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
-    from cpjax.tune.outcome import document
-    from cpjax.tune.tuner import tune  # optax takes a while; other commands should not wait for it
-
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     setting = dict(sections["tune"])
@@ -91,15 +92,7 @@ def run(given: argparse.Namespace) -> int:
     names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}
     free = free_parameters(controller, **names, full_q=setting.pop("full_q", "diagonal") == "full")
     plan = Plan(seed=given.seed, goal=Goal(**sections["goal"]), **setting)
-    with progress("tune") as report:
-        tuning = tune(plant, free, plan, progress=report, checkpoint=given.out / "checkpoint.npz")
-    io.save(given.out / "tuned.json", tuning.controller)
-    io.write_json(given.out / "tune.json", document(tuning, plant, free, plan))
-
-    from cpjax.show.figures import save_figure
-    from cpjax.show.tuning import picture
-
-    save_figure(given.out / "tune.png", picture(tuning))
+    tuning = tuned(given.out, plant, free, plan)
     before = np.asarray(free.physical(free.start()))
     rows = [(label, f"{a:.4g}", f"{b:.4g}") for label, a, b in zip(tuning.labels, before, tuning.physical, strict=True)]
     print_table("Parameters, SI units", ("parameter", "start", "tuned"), rows, text_columns=1)
@@ -109,8 +102,26 @@ def run(given: argparse.Namespace) -> int:
         f"steps of values, {tuning.gradient_steps / 1e6:.2f} M of gradients, {tuning.seconds:.0f} s"
     )
     print(f"wrote {given.out / 'tuned.json'}, tune.json and tune.png")
-    (given.out / "checkpoint.npz").unlink(missing_ok=True)
     return 0 if tuning.success_rate > 0.0 else 1
+
+
+def tuned(out: Path, plant: CartPole, free: FreeParameters, plan: Plan) -> "Tuning":
+    """The tuning, with tuned.json, tune.json and tune.png written."""
+    from cpjax.tune.outcome import document
+    from cpjax.tune.tuner import tune  # optax takes a while; other commands should not wait for it
+
+    checkpoint = out / "checkpoint.npz"
+    with progress("tune") as report:
+        tuning = tune(plant, free, plan, progress=report, checkpoint=checkpoint)
+    io.save(out / "tuned.json", tuning.controller)
+    io.write_json(out / "tune.json", document(tuning, plant, free, plan))
+
+    from cpjax.show.figures import save_figure
+    from cpjax.show.tuning import picture
+
+    save_figure(out / "tune.png", picture(tuning))
+    checkpoint.unlink(missing_ok=True)
+    return tuning
 
 
 def _begin(name: str, plant: Any, chosen: dict[str, Any]) -> Hybrid:

@@ -108,7 +108,7 @@ def responses(shown: Shown, until: float, limit: float) -> Figure:
             axes[2, column].axhline(sign * limit, color="0.4", linewidth=0.8, linestyle=":")
         for row in range(3):
             axes[row, column].grid(alpha=0.3)
-        axes[0, column].legend(frameon=False)
+        axes[1, column].legend(frameon=False, loc="lower right")
     for row, label in enumerate((r"$\theta$, modulo a turn [rad]", "x [m]", "voltage [V]")):
         axes[row, 0].set_ylabel(label)
     axes[1, 0].set_ylim(-2.0, 2.0)

@@ -12,6 +12,7 @@ from cpjax.study.gradient_audit import GradientAudit
 Numbers: TypeAlias = np.ndarray[Any, Any]
 
 _COLOURS: Mapping[str, str] = {"located": "#0072B2", "plain": "#D55E00"}
+TITLE = "Median relative error of derivatives, against finite differences (and how many have the wrong sign)"
 _LEAST = 1e-13  # smaller errors are drawn there
 
 

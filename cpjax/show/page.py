@@ -61,11 +61,11 @@ class Page:
         head = f"<thead><tr>{row('th', header)}</tr></thead>"
         self._body.append(f'<div class="scroll"><table>{head}<tbody>\n{body}\n</tbody></table></div>')
 
-    def picture(self, png: bytes, caption: str) -> None:
-        """A figure with one sentence that says what to see."""
-        data = base64.b64encode(png).decode("ascii")
+    def picture(self, content: bytes, caption: str, kind: str = "png") -> None:
+        """A figure, `kind` png or gif, with one sentence that says what to see."""
+        data = base64.b64encode(content).decode("ascii")
         alt = html.escape(caption, quote=True)
-        image = f'<img alt="{alt}" src="data:image/png;base64,{data}">'
+        image = f'<img alt="{alt}" src="data:image/{kind};base64,{data}">'
         self._body.append(f"<figure>{image}<figcaption>{_inline(caption)}</figcaption></figure>")
 
     def write(self, path: Path) -> None:

@@ -1,0 +1,247 @@
+"""The sections of the report, each from studies that other commands do too."""
+
+import argparse
+from collections.abc import Mapping
+from typing import Any, get_args
+
+from cpjax import io, paper
+from cpjax.cli import basin, pareto
+from cpjax.cli.animate import animated
+from cpjax.cli.audit_gradients import audited
+from cpjax.cli.compare import compared
+from cpjax.cli.options import named_hybrid
+from cpjax.cli.progress import progress
+from cpjax.cli.tune import tuned
+from cpjax.controllers import AngleGate
+from cpjax.presets import preset
+from cpjax.show import comparison as comparison_text
+from cpjax.show import design as design_text
+from cpjax.show import forensics as forensics_text
+from cpjax.show import gradients as gradients_text
+from cpjax.show.figures import DESIGN_NAMES, png, save_figure
+from cpjax.show.page import Page
+from cpjax.state import HANGING
+from cpjax.study.design_check import check_design, document
+from cpjax.study.forensics import audit_gains, write
+from cpjax.study.front_plan import FrontPlan
+from cpjax.study.printed_gains import printed_in_the_paper
+from cpjax.study.reproduction import DESIGNS, Setting
+from cpjax.tune.parameters import free_parameters
+from cpjax.tune.plan import Plan
+from cpjax.tune.starting import beginning
+
+QUICK_FRONTS: Mapping[str, Any] = {
+    "bounds": 11,
+    "candidates": 1024,
+    "steps": 24,
+    "judge_every": 6,
+    "semifinal": 128,
+    "final": 256,
+}
+"""Of a `FrontPlan`."""
+QUICK_TUNING: Mapping[str, Any] = {"candidates": 1023, "restarts": 4, "batch": 8, "steps": 36}
+"""Of a `Plan`."""
+
+
+def designs(page: Page, given: argparse.Namespace) -> None:
+    """The paper's two regulators as linear designs."""
+    plant = paper.appendix_plant()
+    gate = AngleGate(paper.SWITCH_ANGLE)
+    checks = {
+        (design, gains): check_design(plant, paper.regulator(design, gains, plant), gate)
+        for design in get_args(paper.Design)
+        for gains in get_args(paper.Gains)
+    }
+    io.write_json(given.out / "designs.json", {" ".join(key): document(check) for key, check in checks.items()})
+    page.section("The two regulators as linear designs")
+    page.text(
+        "On the appendix's plant, linearised about upright, with the loop broken at the motor's voltage. Inside the "
+        "certified level set the linear loop needs neither the 12 V clip nor the switch at 30 degrees; the last column "
+        "has its widest angle."
+    )
+    page.table(
+        design_text.COMPARISON, [design_text.compared(*key, check) for key, check in checks.items()], text_columns=2
+    )
+    page.note("Every number stands in `designs.json`; `cpjax design` checks any other regulator.")
+
+
+def forensics(page: Page, given: argparse.Namespace) -> None:
+    """Where the printed gains come from."""
+    plant, prints = paper.appendix_plant(), printed_in_the_paper()
+    with progress("audit-gains") as report:
+        audit = audit_gains(prints, plant, starts=16, seed=given.seed, progress=report)
+    write(given.out / "audit_gains.json", audit, prints, plant, seed=given.seed, starts=16)
+    page.section("Where the printed gains come from")
+    page.text(
+        "The printed gains do not follow from the printed parameters. Which parameters would have to differ, and what "
+        "do eight printed numbers say about a plant at all? Residuals are in units of the last printed digit."
+    )
+    for sentence in forensics_text.findings(audit):
+        page.text(sentence)
+    figure = forensics_text.picture(audit)
+    save_figure(given.out / "audit_gains.png", figure)
+    page.picture(
+        png(figure),
+        "Left: the worst residual when one or two parameters may change; a circle marks pairs that explain all eight "
+        "gains. Right: how strongly the gains depend on each combination of parameters.",
+    )
+    page.table(
+        forensics_text.FIT_HEADER,
+        [forensics_text.fit_cells(fit, plant) for fit in forensics_text.shown_fits(audit)],
+        text_columns=2,
+    )
+    page.note("Every fit stands in `audit_gains.json`; `cpjax audit-gains` does the same for any printed gain.")
+    known = [forensics_text.direction_cells(d) for d in audit.directions if d.sensitivity > 0.0]
+    page.table(forensics_text.DIRECTION_HEADER, known, text_columns=1)
+
+
+def gradients(page: Page, given: argparse.Namespace) -> None:
+    """Which gradients through the switch can be trusted."""
+    plant = paper.appendix_plant()
+    audit = audited(given.out, plant, preset("lqr"), {}, given.seed)
+
+    page.section("Can the gradients be trusted?")
+    page.text(
+        "Derivatives of the time outside the target through whole swing-ups of the tuned LQR controller, for every "
+        "parameter of plant and controller, computed in three ways and compared with finite differences: with the "
+        "moments of switching located, with the mode read once per step, and with smooth surrogates of clip and gate."
+    )
+    for sentence in gradients_text.findings(audit):
+        page.text(sentence)
+    page.picture(
+        (given.out / "audit_gradients.png").read_bytes(),
+        "Located gradients agree with finite differences at every horizon; plain ones are wrong as soon as a run has "
+        "crossed the gate.",
+    )
+    page.table(gradients_text.header(audit), gradients_text.cells(audit), text_columns=1)
+    page.note(gradients_text.TITLE + ". Every number stands in `audit_gradients.json`.")
+
+
+def tuning(page: Page, given: argparse.Namespace, size: str) -> None:
+    """A tuning of each design, from bland gains."""
+    plant = paper.appendix_plant()
+    page.section("Tuning by gradients")
+    page.text(
+        "Energy gain, cart terms, gate and Q or poles, moved together by gradients through whole swing-ups: random "
+        "controllers to begin with, the best of them tuned side by side, and the one that validates best kept."
+    )
+    rows = []
+    for design in DESIGNS:
+        plan = Plan(seed=given.seed, **(QUICK_TUNING if size == "quick" else {}))
+        free = free_parameters(beginning("bland", design, plant))
+        folder = given.out / f"tune-{design}"
+        found = tuned(folder, plant, free, plan)
+        page.picture(
+            (folder / "tune.png").read_bytes(),
+            f"{DESIGN_NAMES[design]}: the restarts (grey) and the best of them (blue) settle ever faster, and from "
+            "more starts, as gradients move them.",
+        )
+        rows.append(
+            [
+                DESIGN_NAMES[design],
+                f"{100 * found.success_rate:.2f}",
+                f"{found.settling_time:.3f}",
+                f"{found.value_steps / 1e6:.0f}",
+                f"{found.gradient_steps / 1e6:.2f}",
+                f"{found.seconds:.0f}",
+            ]
+        )
+    page.table(
+        ["regulator", "success [%]", "settling [s]", "million steps of values", "of gradients", "time [s]"], rows, 1
+    )
+    page.note(
+        "Every number stands in `tune-lqr/tune.json` and `tune-placement/tune.json`, the controllers beside them in "
+        "`tuned.json`. Compared below are the tuned controllers that come with cpjax, from a longer search."
+    )
+
+
+def comparison(page: Page, given: argparse.Namespace, setting: Setting) -> None:
+    """The paper's controllers beside the tuned ones."""
+    results = compared(given.out, paper.appendix_plant(), setting, {})
+
+    page.section("Against tuned gains")
+    page.text(
+        "Energy gain, cart terms, gate and Q or poles, tuned together by gradients through whole swing-ups (`cpjax "
+        "tune`), from the same starts as above, of which the tuning has seen none. Which of the two methods is better "
+        "at 12 V?"
+    )
+    for sentence in comparison_text.findings(results):
+        page.text(sentence)
+    page.table(comparison_text.HEADER, [comparison_text.cells(one) for one in results], text_columns=3)
+    page.note("Means over the successful runs. Every number stands in `compare.json` beside this page.")
+    page.picture(
+        (given.out / "responses.png").read_bytes(),
+        "From one start: the best of the paper's controllers pumps for many swings; the tuned ones push and pull once.",
+    )
+    page.picture(
+        (given.out / "phase.png").read_bytes(),
+        "The same runs over angle and rate: the paper's swing-up nears the energy of upright (dashed) swing by swing; "
+        "the tuned one is there after a single reversal, and its regulator takes over far from upright.",
+    )
+    page.picture(
+        (given.out / "by_start.png").read_bytes(),
+        "Settling time by the angle and rate of the start, the paper's best above and tuned below; crosses fail.",
+    )
+
+
+def animation(page: Page, given: argparse.Namespace) -> None:
+    """The paper's controller and the tuned one, moving."""
+    plant = paper.appendix_plant()
+    names = {"corrected/lqr": "paper, corrected, LQR", "tuned_lqr": "tuned, LQR"}
+    controllers = {words: named_hybrid(name, plant) for name, words in names.items()}
+    path, _ = animated(
+        given.out, plant, controllers, HANGING, {"format": "gif", "duration": 6.0, "rate": 20.0}, seed=given.seed
+    )
+    page.picture(
+        path.read_bytes(),
+        "Six seconds from rest: the paper's controller is still pumping when the tuned one has long stood upright.",
+        kind="gif",
+    )
+
+
+def basins(page: Page, given: argparse.Namespace, cells: int) -> None:
+    """Where the paper's and the tuned controllers work."""
+    plant = paper.appendix_plant()
+    controllers = {name: named_hybrid(name, plant) for name in basin.CONTROLLERS}
+    chart = basin.chart_of({"cells": cells}, given.seed)
+    _, header, rows = basin.table(basin.drawn(given.out, plant, controllers, chart, {"duration": 10.0, "dt": 0.002}))
+    page.section("Where they work")
+    page.text(
+        "One run of 10 s from every cell of a map of angle and rate, the cart at rest in the middle. This is the whole "
+        "hybrid loop with its clip, sampled, not certified: a start between two that succeed may fail."
+    )
+    page.picture(
+        (given.out / "basin.png").read_bytes(),
+        "The paper's controllers catch what comes along a narrow band; the tuned ones bring most of the plane to rest. "
+        "The level set that the linear model certifies, in pink, is a speck of what works.",
+    )
+    page.table(header, rows, text_columns=1)
+    page.note("Every number stands in `basin.json`, every run in the files that it names; `cpjax basin` draws others.")
+
+
+def fronts(page: Page, given: argparse.Namespace, size: str) -> None:
+    """What settling faster costs."""
+    plan = FrontPlan(seed=given.seed, **(QUICK_FRONTS if size == "quick" else {}))
+    found = pareto.made(given.out, paper.appendix_plant(), plan, pareto.SUPPLIES)
+    page.section("At what price")
+    page.text(
+        "LQR or pole placement, and what does settling faster cost? Each point is a controller that settles from "
+        f"{100 * plan.success:g} % of unseen starts at least, and that no other found beats in both. Traced by "
+        "gradients, many tunings side by side under one `vmap`, each with a bound on its cost; a random search of as "
+        "many steps is drawn beside them. The hypervolumes reach up to 1.1 times the bland start."
+    )
+    page.picture(
+        (given.out / "pareto.png").read_bytes(),
+        "Down and left is better: tuned by gradients, both methods reach fronts that the same work of random search "
+        "does not, and the two methods lie close together.",
+    )
+    page.picture(
+        (given.out / "supplies.png").read_bytes(),
+        "Settling time against effort at other supplies: with more voltage both methods settle faster, with less they "
+        "need more swings, or find no catch.",
+    )
+    _, header, rows = pareto.table(found)
+    page.table(header, rows, text_columns=2)
+    for sentence in pareto.costs(found):
+        page.note(sentence)
+    page.note("Every point and its parameters stand in `pareto.json`; `cpjax pareto` traces them with more effort.")
