@@ -1,11 +1,12 @@
 """What settling faster costs: trade-off fronts of a design, traced by gradients, and by random search for comparison.
 
 Every point is a hybrid controller. Random candidates, judged by values, are where the search begins. Then many tunings
-go side by side under one `vmap`: each minimises the time outside the target while one cost stays below a bound, for a
-ladder of bounds, every cost, and every supply (epsilon constraints, Haimes and others, 1971). Now and then all are
-judged by the protocol's metrics, and each goes on from the fastest controller met so far that keeps to its bound. Of
-all that were judged, those that no other beats are the front. The random search draws candidates until it has simulated
-as many Runge-Kutta steps, a gradient's counted as the measured multiple of a value's.
+go side by side under one `vmap`: each minimises the time outside the target while the mean of one cost stays below a
+bound, for a ladder of bounds, every cost, and every supply (epsilon constraints, Haimes and others, 1971), by a price
+that rises while the cost exceeds its bound and falls while it does not (Arrow, Hurwicz and Uzawa, 1958). Now and then
+all are judged by the protocol's metrics, and each goes on from the fastest controller met so far that keeps to its
+bound. Of all that were judged, those that no other beats are the front. The random search draws candidates until it has
+simulated as many Runge-Kutta steps, a gradient's counted as the measured multiple of a value's.
 """
 
 import dataclasses
@@ -30,7 +31,7 @@ from cpjax.state import State
 from cpjax.study.front_judge import BATCH, FINAL, JUDGE, SEMIFINAL, Judge, Judged, layers, together
 from cpjax.study.front_plan import COSTS, FrontPlan
 from cpjax.tune import descent
-from cpjax.tune.objective import BoundedTime, Effort, Jerkiness, Travel, Unfinished
+from cpjax.tune.objective import Effort, Jerkiness, PricedTime, Travel, Unfinished
 
 Numbers = np.ndarray[Any, Any]
 Report = Callable[[int, int, str], None]
@@ -148,8 +149,8 @@ def _front(judge: Judge, plan: FrontPlan, met: Judged, supply: float, cost: str,
 class _Aim(NamedTuple):
     """What one tuning of many minimises, and on what."""
 
-    bounds: jax.Array
-    """Of each of `COSTS`; infinite for all but one."""
+    prices: jax.Array
+    """Of a unit of each of `COSTS` [s]; zero for all but one."""
     supply: jax.Array
     """[V]."""
 
@@ -182,12 +183,16 @@ class _Tracer:
         for row, (_, cost, bound) in enumerate(jobs):
             bounds[row, COSTS.index(cost)] = bound
         supplies = np.array([supply for supply, _, _ in jobs])
-        vectors = jnp.asarray(np.stack([begun[supply].fastest(cost, bound)[0] for supply, cost, bound in jobs]))
-        aims = _Aim(jnp.asarray(bounds, vectors.dtype), jnp.asarray(supplies, vectors.dtype))
+        first = [begun[job[0]].fastest(*job[1:], rank=row % plan.variety)[0] for row, job in enumerate(jobs)]
+        vectors = jnp.asarray(np.stack(first))
+        prices = np.where(np.isfinite(bounds), plan.price, 0.0)  # of a bound's worth of each cost
         state = self._optimiser.init(vectors)
         met = dict(begun)
         for step in range(plan.steps):
-            slope = self._gradient(vectors, aims, self._judge.starts(plan.batch, BATCH, step))
+            aims = _Aim(jnp.asarray(prices / bounds, vectors.dtype), jnp.asarray(supplies, vectors.dtype))
+            slope, spent = self._gradient(vectors, aims, self._judge.starts(plan.batch, BATCH, step))
+            grown = prices * np.exp(plan.price_rate * (np.asarray(spent) / bounds - 1.0))
+            prices = np.where(prices > 0.0, np.clip(grown, plan.price / plan.dearest, plan.price * plan.dearest), 0.0)
             vectors, state = descent.step(self._optimiser, vectors, state, slope)
             self.steps += len(jobs) * plan.batch * (round(plan.duration / plan.dt) + self._spare)
             if (step + 1) % plan.judge_every == 0 or step + 1 == plan.steps:
@@ -200,21 +205,22 @@ class _Tracer:
                         judged.costs <= bounds[rows], axis=1
                     )
                     times[rows] = np.where(kept, judged.time, np.inf)
-                better = [met[supply].fastest(cost, bound) for supply, cost, bound in jobs]
-                jump = np.array([time < 0.98 * now for (_, time), now in zip(better, times, strict=True)])
-                vectors = jnp.where(jump[:, None], np.stack([vector for vector, _ in better]), vectors)
-                state = jax.tree.map(functools.partial(_forgotten, rows=jump), state)
+                if step + 1 >= plan.exchange_from * plan.steps:
+                    better = [met[supply].fastest(cost, bound) for supply, cost, bound in jobs]
+                    jump = np.array([time < 0.98 * now for (_, time), now in zip(better, times, strict=True)])
+                    vectors = jnp.where(jump[:, None], np.stack([vector for vector, _ in better]), vectors)
+                    state = jax.tree.map(functools.partial(_forgotten, rows=jump), state)
             report(step + 1, plan.steps, f"{len(jobs)} tunings side by side")
         return met
 
-    def _slope(self, vector: jax.Array, aim: _Aim, starts: State) -> jax.Array:
-        """Of the mean over the starts, no start's sensitivity drowning the others'."""
+    def _slope(self, vector: jax.Array, aim: _Aim, starts: State) -> tuple[jax.Array, jax.Array]:
+        """Of the mean over the starts, no start's sensitivity drowning the others'; and the mean costs."""
         plan, plant, free = self._plan, self._judge.plant_at(aim.supply), self._judge.free_at(aim.supply)
         terms = (TimeOutside(plan.width, plan.width), Effort(), Travel(), Jerkiness(), Unfinished(plan.duration))
-        fold = BoundedTime(terms, tuple(aim.bounds), plan.penalty)
+        fold = PricedTime(terms, tuple(aim.prices), plan.fine)
 
-        def objective(vector: jax.Array, start: State) -> jax.Array:
-            value: jax.Array = measure(
+        def objective(vector: jax.Array, start: State) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+            found: tuple[jax.Array, tuple[jax.Array, ...]] = measure(
                 plant,
                 free.build(vector),
                 start,
@@ -224,12 +230,13 @@ class _Tracer:
                 spare_steps=self._spare,
                 metrics=fold,
             )
-            return value
+            return found
 
-        slopes = jax.vmap(jax.grad(objective), in_axes=(None, 0))(vector, starts)
+        slopes, costs = jax.vmap(jax.grad(objective, has_aux=True), in_axes=(None, 0))(vector, starts)
         sound = jnp.all(jnp.isfinite(slopes), axis=1)
         slopes = jnp.where(sound[:, None], slopes, 0.0)
-        return jnp.mean(descent.shortened(slopes, sound, plan.clip)[:, None] * slopes, axis=0)
+        slope = jnp.mean(descent.shortened(slopes, sound, plan.clip)[:, None] * slopes, axis=0)
+        return slope, jnp.mean(jnp.nan_to_num(jnp.stack(costs, axis=1)), axis=0)
 
 
 def _forgotten(leaf: jax.Array, rows: Numbers) -> jax.Array:

@@ -45,16 +45,16 @@ class Judged(NamedTuple):
         found[self.success < success] = np.inf
         return found
 
-    def fastest(self, cost: str, bound: float) -> tuple[Numbers, float]:
+    def fastest(self, cost: str, bound: float, rank: int = 0) -> tuple[Numbers, float]:
         """Of the controllers that fail least, the fastest that keeps to the bound, and its time; if there is none, the
-        cheapest, and infinity.
+        cheapest, and infinity. Or the second such, the third, and so on, by `rank`, if there are so many.
         """
         time, spent = self.points(cost, np.max(self.success)).T
-        within = np.where(spent <= bound, time, np.inf)
-        best = int(np.argmin(within))
-        if np.isfinite(within[best]):
-            return self.vectors[best], float(time[best])
-        return self.vectors[int(np.argmin(spent))], math.inf
+        within = np.flatnonzero((spent <= bound) & np.isfinite(time))
+        worth = time if len(within) else spent
+        among = within if len(within) else np.arange(len(spent))
+        found = int(among[np.argsort(worth[among], kind="stable")[min(rank, len(among) - 1)]])
+        return self.vectors[found], float(time[found]) if len(within) else math.inf
 
     def ladder(self, cost: str, plan: FrontPlan) -> Numbers:
         """Bounds of a cost (bounds + 1,)."""

@@ -18,7 +18,10 @@ class FrontPlan:
       bounds: of the ladder, for each cost and supply; from `lowest` times the least cost among the candidates
         geometrically to the cost of the fastest; and one more tuning without a bound.
       lowest: see there.
-      penalty: what a cost of twice its bound counts [s].
+      fine: what a second costs that a stopped run leaves undone, beyond itself [s/s].
+      price: of a bound's worth of a cost, at first [s].
+      price_rate: the price grows by exp(price_rate (cost / bound - 1)) in each step.
+      dearest: it stays between `price` / `dearest` and `price` times `dearest`.
       candidates: random controllers to begin with.
       screening: starts by which they are judged.
       steps: of the optimiser.
@@ -29,7 +32,9 @@ class FrontPlan:
       dt: their step [s].
       spare_rate: steps beyond those in each second, for crossings [1/s].
       width: of the target [rad and m].
-      judge_every: steps after which all controllers are judged, and exchanged.
+      variety: how many of the best candidates the tunings begin from, in turn.
+      judge_every: steps after which all controllers are judged.
+      exchange_from: the share of the steps after which each tuning then goes on from the best that was met.
       judging: starts by which they are.
       semifinal: starts by which the best of a front are compared once more: who was lucky with few is not with many.
       final: unseen starts that the points of a front are measured from.
@@ -40,10 +45,13 @@ class FrontPlan:
     """
 
     seed: int = 1
-    bounds: int = 31
+    bounds: int = 39
     lowest: float = 0.85
-    penalty: float = 10.0
-    candidates: int = 4096
+    fine: float = 10.0
+    price: float = 3.0
+    price_rate: float = 1.0
+    dearest: float = 100.0
+    candidates: int = 8192
     screening: int = 16
     steps: int = 100
     batch: int = 8
@@ -53,7 +61,9 @@ class FrontPlan:
     dt: float = 0.02
     spare_rate: float = 20.0
     width: float = 0.05
+    variety: int = 6
     judge_every: int = 10
+    exchange_from: float = 0.4
     judging: int = 96
     semifinal: int = 256
     final: int = 1024
@@ -73,5 +83,7 @@ class FrontPlan:
                 raise InputError(field.name, value, "a finite number above 0")
         if self.lowest >= 1.0:
             raise InputError("lowest", self.lowest, "above 0 and below 1")
+        if not self.dearest >= 1.0:
+            raise InputError("dearest", self.dearest, "at least 1")
         if self.success > 1.0:
             raise InputError("success", self.success, "above 0 and at most 1")

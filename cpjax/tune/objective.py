@@ -179,18 +179,25 @@ class WeightedSum(_Several):
 
 
 @pytree
-class BoundedTime(_Several):
-    """The time outside the target [s], and `penalty` times what each cost exceeds its bound by, relative to it."""
+class PricedTime(_Several):
+    """The time outside the target with every cost at its price [s]; and the costs themselves.
+
+    That is time + unfinished (1 + fine) + sum(price cost): the Lagrangian of a time that is minimised under bounds on
+    the costs' means, for multipliers `prices`.
+    """
 
     terms: tuple[Any, ...]
     """The time, the costs, and the time that a stopped run left undone."""
-    bounds: tuple[Any, ...]
-    penalty: Any
+    prices: tuple[Any, ...]
+    """Of a unit of each cost [s]."""
+    fine: Any
 
-    def finish(self, memory: tuple[Any, ...], last: Sample) -> jax.Array:
+    def finish(self, memory: tuple[Any, ...], last: Sample) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         time, *costs, undone = self._results(memory, last)
-        excess = sum(jnp.maximum(cost / bound - 1.0, 0.0) for cost, bound in zip(costs, self.bounds, strict=True))
-        return time + undone * (1.0 + self.penalty) + self.penalty * excess
+        total = time + undone * (1.0 + self.fine)
+        for price, cost in zip(self.prices, costs, strict=True):
+            total = total + price * cost
+        return total, tuple(costs)
 
 
 @pytree

@@ -13,22 +13,23 @@ from cpjax.sim.metrics import TimeOutside
 from cpjax.study.front import trace_fronts
 from cpjax.study.front_judge import Judged, layers
 from cpjax.study.front_plan import COSTS, FrontPlan
-from cpjax.tune.objective import BoundedTime, Effort, Jerkiness, Travel, Unfinished
+from cpjax.tune.objective import Effort, Jerkiness, PricedTime, Travel, Unfinished
 from cpjax.tune.starting import beginning
 
 PLANT = paper.appendix_plant()
 START = cpjax.State(0.05, 0.0, 3.0, 0.1)
 
 
-def test_what_exceeds_its_bound_counts_relative_to_it():
+def test_the_time_that_is_minimised_has_every_cost_at_its_price():
     law = beginning("bland", "lqr", PLANT)
     run = {"duration": 2.0, "dt": 0.005, "clock": "sampled"}
     protocol = cpjax.measure(PLANT, law, START, **run)
     time = cpjax.measure(PLANT, law, START, metrics=TimeOutside(0.05, 0.05), **run)
     terms = (TimeOutside(0.05, 0.05), Effort(), Travel(), Jerkiness(1e-9), Unfinished(2.0))
-    bounds = (0.5 * protocol.effort, 2.0 * protocol.cart_travel, math.inf)
-    found = cpjax.measure(PLANT, law, START, metrics=BoundedTime(terms, bounds, 10.0), **run)
-    assert float(found) == pytest.approx(float(time) + 10.0)  # effort is twice its bound, the others within theirs
+    total, costs = cpjax.measure(PLANT, law, START, metrics=PricedTime(terms, (0.01, 2.0, 0.0), 10.0), **run)
+    expected = [getattr(protocol, cost) for cost in COSTS]
+    np.testing.assert_allclose(costs, expected, rtol=1e-5)
+    assert float(total) == pytest.approx(float(time + 0.01 * protocol.effort + 2.0 * protocol.cart_travel))
 
 
 def judged(rows):
@@ -41,6 +42,8 @@ def test_the_fastest_within_a_bound_never_fails_if_any_does_not():
     met = judged([(1.0, 3.0, 10.0), (1.0, 2.0, 20.0), (0.9, 1.0, 5.0), (1.0, 4.0, 8.0)])
     assert met.fastest("effort", 15.0)[0] == 0.0
     assert met.fastest("effort", 25.0) == (1.0, 2.0)
+    assert met.fastest("effort", 25.0, rank=1) == (0.0, 3.0)
+    assert met.fastest("effort", 25.0, rank=9) == (3.0, 4.0)  # there are but three
     vector, time = met.fastest("effort", 7.0)
     assert (vector, time) == (3.0, math.inf)  # none keeps to it: the cheapest of those that never fail
 
@@ -55,7 +58,13 @@ def test_layers_begin_with_what_no_other_beats_and_end_with_what_is_finite():
 
 @pytest.mark.parametrize(
     ("change", "field"),
-    [({"bounds": 0}, "bounds"), ({"dt": -1.0}, "dt"), ({"lowest": 1.0}, "lowest"), ({"success": 1.5}, "success")],
+    [
+        ({"bounds": 0}, "bounds"),
+        ({"dt": -1.0}, "dt"),
+        ({"lowest": 1.0}, "lowest"),
+        ({"success": 1.5}, "success"),
+        ({"dearest": 0.5}, "dearest"),
+    ],
 )
 def test_a_bad_plan_is_refused(change, field):
     with pytest.raises(InputError, match=field):
