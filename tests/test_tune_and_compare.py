@@ -10,7 +10,8 @@ from cpjax import io, paper
 from cpjax.controllers import LqrWeights, PoleFactors
 from cpjax.errors import InputError
 from cpjax.presets import preset
-from cpjax.study.comparison import DESIGNS, best, compare, entries
+from cpjax.show.comparison import phase_portraits
+from cpjax.study.comparison import DESIGNS, Compared, Entry, best, compare, entries
 from cpjax.study.reproduction import Setting
 from cpjax.tune import tuner
 from cpjax.tune.outcome import Tuning
@@ -136,7 +137,24 @@ def test_compare_writes_its_table_and_pictures(tmp_path, command):
     assert done.code == 0
     assert "Tuned:" in done.out
     assert len(json.loads((tmp_path / "compare.json").read_text())["rows"]) == 10
-    assert {path.name for path in tmp_path.iterdir()} == {"compare.json", "responses.png", "by_start.png"}
+    pictures = {"responses.png", "phase.png", "by_start.png"}
+    assert {path.name for path in tmp_path.iterdir()} == {"compare.json", *pictures}
+
+
+def test_the_phase_portrait_shows_the_run_and_the_gate_where_the_controller_has_it():
+    controller = preset("lqr")
+    run = cpjax.rollout(PLANT, controller, cpjax.HANGING, duration=4.0, dt=0.005, clock="sampled")
+    one = Compared(Entry("tuned", "lqr", "tuned", controller), run.metrics, {})
+    figure = phase_portraits(PLANT, {(kind, design): (one, run) for kind in ("paper", "tuned") for design in DESIGNS})
+    swing_up, regulating, start = figure.axes[0].lines
+    theta, rate = np.concatenate([np.stack(line.get_data()) for line in (swing_up, regulating)], axis=1)
+    drawn = np.isfinite(theta) & np.isfinite(rate)
+    assert np.abs(theta[drawn]).max() <= np.pi
+    assert np.isclose(rate[drawn].max(), np.asarray(run.state.theta_dot).max())
+    assert start.get_data()[0][0] == pytest.approx(np.pi)
+    half_angle = float(controller.gate.half_angle)
+    edge = max(path.vertices[:, 0].max() for path in figure.axes[0].collections[-1].get_paths())
+    assert edge == pytest.approx(half_angle, abs=0.02)  # at rest
 
 
 def test_compare_refuses_a_file_without_a_hybrid(tmp_path, command):
