@@ -4,8 +4,9 @@
 
 Values: the settling time of 192 starts, 5 s, a control held over 4 ms, as a search without gradients asks for them.
 With a gradient: a step of `cpjax tune` as a `Plan` has it, 8 controllers and 16 starts each, 3 s at 20 ms, located
-switching, in the same nine parameters. Either runs with and without two options of XLA's CPU compiler, each
-combination in a process of its own, and all processes in turn; the best of each counts.
+switching, in the same nine parameters. And a step of `cpjax pareto`: time and all costs at once, as many controllers
+as one core has, 8 starts each, 8 s, the supply a parameter of each. Each runs with and without two options of XLA's
+CPU compiler, each combination in a process of its own, and all processes in turn; the best of each counts.
 """
 
 import itertools
@@ -28,13 +29,16 @@ from cpjax.sim.metrics import TimeOutside
 from cpjax.sim.rollout import measure
 from cpjax.starts import sample_starts
 from cpjax.state import State
+from cpjax.study.front import Aim, Tracer
+from cpjax.study.front_judge import BATCH, Judge
+from cpjax.study.front_plan import FrontPlan
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
 from cpjax.tune.starting import beginning
 
 FUSION, LOOPS = "xla_cpu_use_multi_output_fusion=true", "xla_cpu_small_while_loop_byte_threshold=16777216"
 OPTIONS = {"none": "", "fusion and small loops": f"{FUSION},{LOOPS}"}
-WORK = ("values", "gradients")
+WORK = ("values", "gradients", "fronts")
 
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
@@ -59,8 +63,8 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
         best = {
             w: max(r["million_steps_per_second"] for r in rows if (r["design"], r["work"]) == (design, w)) for w in WORK
         }
-        weights[design] = best["values"] / best["gradients"]
-        print(f"{design}: a step with a gradient costs {weights[design]:.1f} steps of the fastest values")
+        weights[design] = {work: best["values"] / best[work] for work in WORK[1:]}
+        print(f"{design}: a step with a gradient costs so many steps of the fastest values: {weights[design]}")
     io.write_json(out / "tuner_cost.json", {"versions": io.versions(), "rows": rows, "weights": weights})
     return rows
 
@@ -79,6 +83,8 @@ def _measure(design: Any, work: str, quick: bool) -> float:
     plant = paper.appendix_plant()
     free = free_parameters(beginning("bland", design, plant))
     plan = Plan()
+    if work == "fronts":
+        return _measure_fronts(plant, design, quick)
     with_gradient = (plan.restarts, plan.batch, plan.duration, plan.dt)
     restarts, count, duration, dt = (1, 192, 5.0, 0.004) if work == "values" else with_gradient
     starts = jax.tree.map(jnp.asarray, sample_starts("hanging", 2 if quick else count, seed=1))
@@ -105,6 +111,23 @@ def _measure(design: Any, work: str, quick: bool) -> float:
         times.append(time.perf_counter() - began)
     steps = round(duration / dt) + (plan.spare_steps if work == "gradients" else 0)
     return restarts * jnp.shape(starts.x)[0] * steps / min(times[1:])
+
+
+def _measure_fronts(plant: Any, design: Any, quick: bool) -> float:
+    plan = FrontPlan()
+    judge = Judge(plant, design, plan)
+    tracer = Tracer(judge, plan)
+    count = 2 if quick else 3 * (plan.bounds + 1)
+    random = np.random.default_rng(1)
+    start = np.asarray(judge.free.start())
+    vectors = jnp.asarray(start + 0.1 * random.standard_normal((count, len(start))))
+    aims = Aim(jnp.full((count, 3), 0.01), jnp.full((count,), 12.0))
+    times = []
+    for step in range(2 if quick else 8):
+        began = time.perf_counter()
+        jax.block_until_ready(tracer.gradient(vectors, aims, judge.starts(plan.batch, BATCH, step)))  # type: ignore[no-untyped-call]  # untyped in JAX
+        times.append(time.perf_counter() - began)
+    return count * plan.batch * tracer.steps_of_a_run / min(times[1:])
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 import time
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -18,12 +18,16 @@ from cpjax.study.comparison import Compared, compare, entries
 from cpjax.study.front_plan import COSTS, FrontPlan
 from cpjax.study.reproduction import DESIGNS, Setting
 
+if TYPE_CHECKING:  # imports of it take a while
+    from cpjax.show.front import Curve
+    from cpjax.study.front_yardstick import Yardstick
+
 Found: TypeAlias = dict[paper.Design, dict[str, Any]]
 """The fronts of each design, as plain values."""
 
 SUPPLIES = (6.0, 9.0, 24.0)
 _PLANNED = {
-    "bounds": "tunings for each cost and supply",
+    "bounds": "tunings with a bound for each cost and supply, and one more without",
     "candidates": "random controllers to begin with",
     "steps": "of the optimiser",
     "batch": "starts of a step",
@@ -69,22 +73,27 @@ def run(given: argparse.Namespace) -> int:
     plan = FrontPlan(seed=given.seed, **chosen)
     found = made(given.out, plant, plan, supplies)
     print_table(*table(found), text_columns=2)
-    print(*costs(found), sep="\n")
+    from cpjax.show.front import findings
+
+    print(*findings(curves_of(found)), *costs(found), sep="\n")
     print(f"wrote {given.out / 'pareto.json'}, pareto.png and supplies.png")
     return 0
 
 
 def made(out: Path, plant: CartPole, plan: FrontPlan, supplies: tuple[float, ...]) -> Found:
     """The fronts of both designs, with pareto.json, pareto.png and supplies.png written."""
-    found = {design: traced(out, plant, design, plan, supplies) for design in DESIGNS}
-    known = compare(plant, entries(plant), Setting(count=plan.final, seed=plan.seed))[1]
+    from cpjax.study.front_yardstick import yardstick
+
+    measure = yardstick(plant, plan, supplies)
+    found = {design: traced(out, plant, design, plan, supplies, measure) for design in DESIGNS}
+    known = known_controllers(plant, plan)
     document = {
         "what": "mean settling time against mean cost, of controllers that no other found beats",
         "versions": io.versions(),
         "plan": dataclasses.asdict(plan),
         "plant": io.encode(plant),
         "fronts": found,
-        "known": [{"name": _name(one), "design": one.entry.design, **one.summary} for one in known],
+        "known": [{"name": name, "design": one.entry.design, **one.summary} for name, one in known],
     }
     io.write_json(out / "pareto.json", document)
     draw(out, plant, found, known)
@@ -93,10 +102,27 @@ def made(out: Path, plant: CartPole, plan: FrontPlan, supplies: tuple[float, ...
     return found
 
 
+def known_controllers(plant: CartPole, plan: FrontPlan) -> list[tuple[str, Compared]]:
+    """The paper's printed gains and the controllers that come with cpjax, from the starts that measure the points."""
+    from cpjax.study.front_judge import FINAL
+    from cpjax.tune.descent import seed_of
+
+    setting = Setting(count=plan.final, seed=seed_of(plan.seed, FINAL, 0), duration=plan.horizon, dt=plan.final_dt)
+    chosen = [one for one in entries(plant) if one.gains != "computed"]
+    own = plant == paper.appendix_plant()
+    preset = "tuned, as shipped" if own else "as shipped for the appendix's plant"
+    compared = compare(plant, chosen, setting)[1]
+    return [(preset if one.entry.gains == "tuned" else one.entry.name, one) for one in compared]
+
+
 def traced(
-    out: Path, plant: CartPole, design: paper.Design, plan: FrontPlan, supplies: tuple[float, ...]
+    out: Path, plant: CartPole, design: paper.Design, plan: FrontPlan, supplies: tuple[float, ...], measure: "Yardstick"
 ) -> dict[str, Any]:
-    """A design's fronts as plain values, from the part that an interrupted run left if there is one."""
+    """A design's fronts as plain values, from the part that an interrupted run left if there is one.
+
+    Raises:
+      InputError: the part is of another request.
+    """
     from cpjax.study.front import trace_fronts  # optax takes a while; other commands should not wait for it
 
     request = io.dump_json(
@@ -105,17 +131,19 @@ def traced(
     path = _part(out, design)
     if path.exists():
         part = io.read_table(path)
-        if part["request"] == request:
-            found: dict[str, Any] = part["found"]
-            return found
+        if part.get("request") != request:
+            raise InputError("out", str(out), f"a folder without a part of other fronts; use another, or remove {path}")
+        kept: dict[str, Any] = part["found"]
+        return kept
     begin = time.perf_counter()
     with progress(f"pareto, {design}") as report:
-        fronts = trace_fronts(plant, design, plan, supplies=supplies, report=report)
+        fronts = trace_fronts(plant, design, plan, measure.reference, supplies=supplies, report=report)
     rows = [
         {
             "supply": supply,
             "cost": cost,
-            "bland": fronts.bland[supply, cost].tolist(),
+            "bland": measure.bland[design][supply, cost].tolist(),
+            "reference": measure.reference[supply, cost].tolist(),
             **{
                 kind: {
                     "points": front.points.tolist(),
@@ -129,48 +157,49 @@ def traced(
         }
         for supply, cost in fronts.traced
     ]
-    result = {"rows": rows, "steps": fronts.steps, "seconds": time.perf_counter() - begin}
-    io.write_json(path, {"request": request, "found": result})
-    return result
+    steps = [{"supply": supply, **counted} for supply, counted in fronts.steps.items()]
+    found = {"rows": rows, "steps": steps, "seconds": time.perf_counter() - begin}
+    io.write_json(path, {"request": request, "found": found})
+    return found
 
 
-def draw(out: Path, plant: CartPole, found: Found, compared: list[Compared]) -> None:
+def draw(out: Path, plant: CartPole, found: Found, controllers: list[tuple[str, Compared]]) -> None:
     """The pictures."""
     from cpjax.show.figures import save_figure
-    from cpjax.show.front import Curve, Known, by_supply, fronts
+    from cpjax.show.front import Known, by_supply, fronts
 
     own = float(plant.motor.voltage_limit)
-
-    def row_of(design: paper.Design, supply: float, cost: str) -> dict[str, Any]:
-        rows: list[dict[str, Any]] = found[design]["rows"]
-        return next(row for row in rows if row["supply"] == supply and row["cost"] == cost)
-
-    def curve(design: paper.Design, supply: float, cost: str) -> Curve:
-        row = row_of(design, supply, cost)
-        traced, random = (np.reshape(row[kind]["points"], (-1, 2)) for kind in ("traced", "random"))
-        return Curve(traced, random, row["traced"]["volume"], row["random"]["volume"])
-
+    curves = curves_of(found)
     known = {
         cost: [
-            Known(_name(one), one.entry.design, time, one.summary["over_successes"][cost]["mean"], rate)
-            for one in compared
-            if one.entry.gains != "computed" and (rate := one.summary["success_rate"]) > 0.0
+            Known(name, one.entry.design, time, one.summary["over_successes"][cost]["mean"], rate)
+            for name, one in controllers
+            if (rate := one.summary["success_rate"]) > 0.0
             for time in [one.summary["over_successes"]["settling_time"]["mean"]]
         ]
         for cost in COSTS
     }
-    curves: dict[str, dict[str, Curve]] = {
-        cost: {design: curve(design, own, cost) for design in DESIGNS} for cost in COSTS
-    }
-    bland: dict[str, dict[str, Any]] = {
-        cost: {design: np.asarray(row_of(design, own, cost)["bland"]) for design in DESIGNS} for cost in COSTS
-    }
-    save_figure(out / "pareto.png", fronts(curves, bland, known))
-    supplies = [row["supply"] for row in found[DESIGNS[0]]["rows"] if row["cost"] == "effort"]
-    panels: dict[float, dict[str, Curve]] = {
-        supply: {design: curve(design, supply, "effort") for design in DESIGNS} for supply in supplies
-    }
-    save_figure(out / "supplies.png", by_supply(panels))
+    bland: dict[str, dict[str, Any]] = {cost: {} for cost in COSTS}
+    for design in DESIGNS:
+        for row in found[design]["rows"]:
+            if row["supply"] == own:
+                bland[row["cost"]][design] = np.asarray(row["bland"], float)
+    save_figure(out / "pareto.png", fronts({cost: curves[own, cost] for cost in COSTS}, bland, known))
+    supplies = {supply: designs for (supply, cost), designs in curves.items() if cost == "effort"}
+    save_figure(out / "supplies.png", by_supply(supplies))
+
+
+def curves_of(found: Found) -> "dict[tuple[float, str], dict[str, Curve]]":
+    """Fronts by supply and cost, and by design."""
+    from cpjax.show.front import Curve
+
+    curves: dict[tuple[float, str], dict[str, Curve]] = {}
+    for design in DESIGNS:
+        for row in found[design]["rows"]:
+            traced, random = (np.reshape(row[kind]["points"], (-1, 2)) for kind in ("traced", "random"))
+            curve = Curve(traced, random, row["traced"]["volume"], row["random"]["volume"])
+            curves.setdefault((row["supply"], row["cost"]), {})[design] = curve
+    return curves
 
 
 def table(found: Found) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
@@ -197,7 +226,8 @@ def costs(found: Found) -> list[str]:
     """What each design's search took, in words."""
     sentences = []
     for design in DESIGNS:
-        steps = {kind: f"{count / 1e6:.0f} M" for kind, count in found[design]["steps"].items()}
+        total = {kind: sum(one[kind] for one in found[design]["steps"]) for kind in ("values", "gradients", "random")}
+        steps = {kind: f"{count / 1e6:.0f} M" for kind, count in total.items()}
         sentences.append(
             f"{design}: {steps['values']} steps of values and {steps['gradients']} of gradients by the tracing, "
             f"{steps['random']} of values by the random search; {found[design]['seconds']:.0f} s"
@@ -207,12 +237,8 @@ def costs(found: Found) -> list[str]:
 
 def _none(front: dict[str, Any]) -> str:
     """Instead of a number of points."""
-    return f"none (at best {100 * front['best_success']:.0f} % settle)"
+    return f"none (the best settles from {100 * front['best_success']:.1f} %)"
 
 
 def _part(out: Path, design: str) -> Path:
     return out / f"pareto-{design}.part.json"
-
-
-def _name(one: Compared) -> str:
-    return "tuned" if one.entry.gains == "tuned" else one.entry.name

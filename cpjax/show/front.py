@@ -14,7 +14,7 @@ COST_LABELS = {
     "cart_travel": "cart travel [m]",
     "voltage_variation": "variation of the voltage [V]",
 }
-MARKERS = {"tuned": "D", "paper, as printed": "^", "paper, corrected": "v"}
+_MARKERS = {"paper, as printed": "^", "paper, corrected": "v"}  # others a diamond
 
 
 class Curve(NamedTuple):
@@ -23,6 +23,7 @@ class Curve(NamedTuple):
     traced: np.ndarray[Any, Any]
     """Settling times and costs (n, 2)."""
     random: np.ndarray[Any, Any]
+    """Likewise (m, 2)."""
     traced_volume: float
     random_volume: float
 
@@ -33,8 +34,10 @@ class Known(NamedTuple):
     label: str
     design: str
     time: float
+    """Mean settling time [s]."""
     cost: float
     success: float
+    """Share of the starts."""
 
 
 def fronts(
@@ -49,12 +52,15 @@ def fronts(
         for design, curve in designs.items():
             _draw(axes, design, curve)
         for design, point in bland[cost].items():
-            axes.plot(*point, "*", color=DESIGN_COLOURS[design], markersize=11, label=f"{DESIGN_NAMES[design]}, bland")
+            if np.all(np.isfinite(point)):
+                axes.plot(
+                    *point, "*", color=DESIGN_COLOURS[design], markersize=11, label=f"{DESIGN_NAMES[design]}, bland"
+                )
         # The view is that of fronts and bland starts; a controller beyond it stands at its edge.
         shown = np.concatenate(
             [*(np.concatenate([c.traced, c.random]) for c in designs.values()), [*bland[cost].values()]]
         )
-        low, high = np.min(shown, axis=0), np.max(shown, axis=0)
+        low, high = np.nanmin(shown, axis=0), np.nanmax(shown, axis=0)
         low, high = low - 0.12 * (high - low), high + 0.12 * (high - low)
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
@@ -64,7 +70,7 @@ def fronts(
             )
             at = np.clip([one.time, one.cost], low, high)
             style = {"color": DESIGN_COLOURS[one.design], "fillstyle": "none", "markersize": 9, "clip_on": False}
-            axes.plot(*at, MARKERS[one.label], label=label, **style)
+            axes.plot(*at, _MARKERS.get(one.label, "D"), label=label, **style)
         axes.set_xlabel("mean settling time [s]")
         axes.set_ylabel("mean " + COST_LABELS[cost])
         axes.grid(alpha=0.3, which="both")
@@ -97,6 +103,29 @@ def by_supply(curves: Mapping[float, Mapping[str, Curve]]) -> Figure:
     return figure
 
 
+def findings(curves: Mapping[tuple[float, str], Mapping[str, Curve]]) -> list[str]:
+    """What the fronts say of the two methods and of gradients, a sentence for each supply and cost."""
+    sentences = []
+    for (supply, cost), designs in curves.items():
+        where = f"Settling time against {cost.replace('_', ' ')} at {supply:g} V: "
+        found = {design: curve for design, curve in designs.items() if curve.traced_volume}
+        if not found:
+            sentences.append(where + "gradients find no controller that settles from enough starts.")
+            continue
+        said = [
+            f"{DESIGN_NAMES[design]} settles after {curve.traced[0, 0]:.2f} s at the fastest, and random search "
+            f"dominates {abs(share):.0f} % {'less' if share >= 0 else 'more'} than its front"
+            for design, curve in found.items()
+            for share in [100.0 * (1.0 - curve.random_volume / curve.traced_volume)]
+        ]
+        if len(found) == 2:
+            ahead, behind = sorted(found, key=lambda design: -found[design].traced_volume)
+            lead = 100.0 * (1.0 - found[behind].traced_volume / found[ahead].traced_volume)
+            said.append(f"{DESIGN_NAMES[behind]} dominates {lead:.0f} % less than {DESIGN_NAMES[ahead]}")
+        sentences.append(where + "; ".join(said) + ".")
+    return sentences
+
+
 def _draw(axes: Axes, design: str, curve: Curve) -> None:
     colour, name = DESIGN_COLOURS[design], DESIGN_NAMES[design]
     marker = "s" if design == "lqr" else "o"
@@ -111,5 +140,8 @@ def _verdict(designs: Mapping[str, Curve]) -> str:
     parts = []
     for design, curve in designs.items():
         if curve.traced_volume:
-            parts.append(f"{DESIGN_NAMES[design]} {100 * (curve.random_volume / curve.traced_volume - 1.0):+.0f} %")
-    return "hypervolume of random search: " + ("\n" + ", ".join(parts) if parts else "both 0")
+            share = f"{100 * (curve.random_volume / curve.traced_volume - 1.0):+.0f} %"
+        else:
+            share = "finds points, gradients none" if curve.random_volume else "none"
+        parts.append(f"{DESIGN_NAMES[design]} {share}")
+    return "hypervolume of random search:\n" + ", ".join(parts)

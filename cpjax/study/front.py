@@ -6,13 +6,17 @@ bound, for a ladder of bounds, every cost, and every supply (epsilon constraints
 that rises while the cost exceeds its bound and falls while it does not (Arrow, Hurwicz and Uzawa, 1958). Now and then
 all are judged by the protocol's metrics, and each goes on from the fastest controller met so far that keeps to its
 bound. Of all that were judged, those that no other beats are the front. The random search draws candidates until it has
-simulated as many Runge-Kutta steps, a gradient's counted as the measured multiple of a value's.
+simulated as many Runge-Kutta steps at each supply, a gradient's counted as the measured multiple of a value's.
+
+What is steered and what is judged differ: a price follows the mean cost of a few starts over a short run, on the
+continuous clock and failures included; a bound is kept by the mean over the successes, by the protocol.
 """
 
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -22,25 +26,24 @@ import optax
 from jax.sharding import Mesh, PartitionSpec
 
 from cpjax import paper
-from cpjax.errors import InputError
 from cpjax.numeric.pareto import hypervolume, nondominated
 from cpjax.plant import CartPole
 from cpjax.sim.metrics import TimeOutside
 from cpjax.sim.rollout import measure
 from cpjax.state import State
 from cpjax.study.front_judge import BATCH, FINAL, JUDGE, SEMIFINAL, Judge, Judged, layers, together
-from cpjax.study.front_plan import COSTS, FrontPlan
+from cpjax.study.front_plan import COSTS, FrontPlan, Lane
+from cpjax.study.front_yardstick import lanes
 from cpjax.tune import descent
 from cpjax.tune.objective import Effort, Jerkiness, PricedTime, Travel, Unfinished
 
 Numbers = np.ndarray[Any, Any]
 Report = Callable[[int, int, str], None]
-Lane = tuple[float, str]
-"""A supply [V] and a cost."""
+GRADIENT_STEP = 60.0
+"""Steps of the fastest values that take as long as one of a gradient of these tunings (`experiments/tuner_cost.py`)."""
 
-GRADIENT_STEP = 36.0
-"""Steps of the fastest values that take as long as one of a gradient with located switching
-(`experiments/tuner_cost.py`)."""
+FOLDS: Mapping[str, Any] = {"effort": Effort(), "cart_travel": Travel(), "voltage_variation": Jerkiness()}
+"""What is differentiable of each of `COSTS`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +55,7 @@ class Front:
       success: share of those starts (n,).
       vectors: the controllers' free parameters (n, d).
       volume: the hypervolume up to the reference.
-      best_success: the greatest share of the starts from which any controller met settled, when they were first judged.
+      best_success: the greatest share of the semifinal's starts that any controller settled from.
     """
 
     points: Numbers
@@ -69,68 +72,71 @@ class Fronts:
     Attributes:
       traced: by gradients: (supply [V], cost) to front.
       random: by random search, likewise.
-      bland: (supply, cost) to the bland start's settling time and cost (2,), at the plant's own supply where it settles
-        from no start; 1.1 times as much is the hypervolumes' reference.
-      steps: Runge-Kutta steps of values and of gradients that the tracing took, and the values of the random search.
+      steps: for each supply the Runge-Kutta steps of values and of gradients that the tracing took, and of the random
+        search.
     """
 
     traced: dict[Lane, Front]
     random: dict[Lane, Front]
-    bland: dict[Lane, Numbers]
-    steps: dict[str, int]
+    steps: dict[float, dict[str, int]]
 
 
 def trace_fronts(
-    plant: CartPole, design: paper.Design, plan: FrontPlan, *, supplies: tuple[float, ...] = (), report: Report
+    plant: CartPole,
+    design: paper.Design,
+    plan: FrontPlan,
+    reference: Mapping[Lane, Numbers],
+    *,
+    supplies: tuple[float, ...] = (),
+    report: Report,
 ) -> Fronts:
     """The fronts of settling time against every cost at the plant's own supply, and against effort at others.
 
     Args:
+      reference: of the hypervolumes; see `front_yardstick`.
       supplies: further voltage limits [V].
-      report: called with the steps done, their number, and what they are.
+      report: called with the parts done, their number, and what they are.
 
     Raises:
       InputError: a plant without a voltage limit.
     """
-    own = float(plant.motor.voltage_limit)
-    if not math.isfinite(own):
-        raise InputError("plant.motor.voltage_limit", own, "a finite number: effort is measured by it")
+    wanted = lanes(plant, supplies)
+    everywhere = list(dict.fromkeys(supply for supply, _ in wanted))
+    parts = plan.steps + len(everywhere) + 2 * len(wanted)
     judge = Judge(plant, design, plan)
-    everywhere = list(dict.fromkeys([own, *map(float, supplies)]))
-    lanes = [(own, cost) for cost in COSTS] + [(supply, "effort") for supply in everywhere[1:]]
-    vector = np.asarray(judge.free.start())[None]
-    start = {supply: judge.judge(vector, supply, plan.final, FINAL) for supply in everywhere}
-    bland: dict[Lane, Numbers] = {}
-    for supply, cost in lanes:
-        point = start[supply].points(cost, 0.0)[0]
-        bland[supply, cost] = point if np.all(np.isfinite(point)) else bland[own, cost]  # it never settles
-
-    report(0, plan.steps, "screening candidates")
-    judge.steps = 0
+    report(0, parts, "screening candidates")
     begun = {supply: judge.begin(supply, plan.candidates, 0) for supply in everywhere}
-    tracer = _Tracer(judge, plan)
-    met = tracer.trace(begun, lanes, report)
-    values, gradients = judge.steps, tracer.steps
-    report(plan.steps, plan.steps, "random search of the same cost")
-    budget = values + GRADIENT_STEP * gradients
-    # As many as the tracing's will be judged a second time; the rest goes into screening.
+    tracer = Tracer(judge, plan)
+    met = tracer.trace(begun, wanted, lambda done, text: report(done, parts, text))
+    values = judge.steps
+
+    # For each supply as much work; as many as the tracing's will be judged a second time, the rest goes into screening.
+    judge.steps = Counter()
+    drawn = {}
     run = round(plan.horizon / plan.judging_dt)
-    budget -= run * plan.judging * sum(len(one.vectors) for one in begun.values())
-    count = max(1, int(budget / (run * plan.screening * len(everywhere))))
-    judge.steps = 0
-    drawn = {supply: judge.begin(supply, count, 1) for supply in everywhere}
-    steps = {"values": values, "gradients": gradients, "random": judge.steps}
+    for number, supply in enumerate(everywhere):
+        report(plan.steps + number, parts, f"random search of the same cost, {supply:g} V")
+        budget = values[supply] + GRADIENT_STEP * tracer.steps[supply] - run * plan.judging * len(begun[supply].vectors)
+        drawn[supply] = judge.begin(supply, max(1, int(budget / (run * plan.screening))), 1)
+    steps = {
+        supply: {"values": values[supply], "gradients": tracer.steps[supply], "random": judge.steps[supply]}
+        for supply in everywhere
+    }
 
-    def fronts(found: dict[float, Judged]) -> dict[Lane, Front]:
-        return {lane: _front(judge, plan, found[lane[0]], *lane, 1.1 * bland[lane]) for lane in lanes}
-
-    return Fronts(fronts(met), fronts(drawn), bland, steps)
+    fronts: list[dict[Lane, Front]] = []
+    for which, found in enumerate((met, drawn)):
+        fronts.append({})
+        for number, lane in enumerate(wanted):
+            report(parts - (2 - which) * len(wanted) + number, parts, "measuring the points")
+            fronts[-1][lane] = _front(judge, plan, found[lane[0]], *lane, reference[lane])
+    report(parts, parts, "done")
+    return Fronts(fronts[0], fronts[1], steps)
 
 
 def _front(judge: Judge, plan: FrontPlan, met: Judged, supply: float, cost: str, reference: Numbers) -> Front:
     """Of all controllers met, those that no other beats, measured once more from unseen starts."""
     # Few starts say little about one failure in a hundred: who failed a few of them may run in the semifinal.
-    lenient = 1.0 - 3.0 * (1.0 - plan.success)
+    lenient = met.enough(1.0 - 3.0 * (1.0 - plan.success))
     chosen = np.unique(np.concatenate([layers(met.points(cost, share), 3 * plan.bounds) for share in (1.0, lenient)]))
     semifinal = judge.judge(met.vectors[chosen], supply, plan.semifinal, SEMIFINAL)
     chosen = chosen[layers(semifinal.points(cost, plan.success), plan.bounds)]
@@ -142,11 +148,11 @@ def _front(judge: Judge, plan: FrontPlan, met: Judged, supply: float, cost: str,
         final.success[kept],
         final.vectors[kept],
         hypervolume(points[kept], reference),
-        float(np.max(met.success)),
+        float(np.max(semifinal.success)),
     )
 
 
-class _Aim(NamedTuple):
+class Aim(NamedTuple):
     """What one tuning of many minimises, and on what."""
 
     prices: jax.Array
@@ -155,25 +161,31 @@ class _Aim(NamedTuple):
     """[V]."""
 
 
-class _Tracer:
+class Tracer:
     """One design's tunings, side by side.
 
     Attributes:
-      steps: Runge-Kutta steps of all gradients.
+      steps: Runge-Kutta steps of all gradients, by supply [V].
+      steps_of_a_run: those of one start.
+      gradient: slopes (n, d) and mean costs (n, number of `COSTS`) of controllers (n, d), aims (n,) and starts.
     """
 
     def __init__(self, judge: Judge, plan: FrontPlan) -> None:
-        self._judge, self._plan, self.steps = judge, plan, 0
+        self._judge, self._plan = judge, plan
+        self.steps: Counter[float] = Counter()
         self._optimiser = optax.adam(optax.cosine_decay_schedule(plan.learning_rate, max(1, plan.steps), 0.1))
         self._spare = math.ceil(plan.spare_rate * plan.duration)
+        self.steps_of_a_run = round(plan.duration / plan.dt) + self._spare
         mesh = Mesh(np.array(jax.devices()), ("tunings",))
         shared_out: Any = PartitionSpec("tunings")  # type: ignore[no-untyped-call]  # untyped in JAX
         same: Any = PartitionSpec()  # type: ignore[no-untyped-call]  # untyped in JAX
         each = jax.vmap(self._slope, in_axes=(0, 0, None))
         specs = {"in_specs": (shared_out, shared_out, same), "out_specs": shared_out}
-        self._gradient = jax.jit(jax.shard_map(each, mesh=mesh, check_vma=False, **specs))
+        self.gradient = jax.jit(jax.shard_map(each, mesh=mesh, check_vma=False, **specs))
 
-    def trace(self, begun: dict[float, Judged], fronts: list[Lane], report: Report) -> dict[float, Judged]:
+    def trace(
+        self, begun: dict[float, Judged], fronts: list[Lane], report: Callable[[int, str], None]
+    ) -> dict[float, Judged]:
         """All controllers met, by supply: what `begun` has, and all that were judged on the way."""
         plan = self._plan
         jobs = [(supply, cost, bound) for supply, cost in fronts for bound in begun[supply].ladder(cost, plan)]
@@ -183,40 +195,41 @@ class _Tracer:
         for row, (_, cost, bound) in enumerate(jobs):
             bounds[row, COSTS.index(cost)] = bound
         supplies = np.array([supply for supply, _, _ in jobs])
-        first = [begun[job[0]].fastest(*job[1:], rank=row % plan.variety)[0] for row, job in enumerate(jobs)]
+        first = [begun[job[0]].fastest(*job[1:], plan.success, row % plan.variety)[0] for row, job in enumerate(jobs)]
         vectors = jnp.asarray(np.stack(first))
         prices = np.where(np.isfinite(bounds), plan.price, 0.0)  # of a bound's worth of each cost
         state = self._optimiser.init(vectors)
         met = dict(begun)
         for step in range(plan.steps):
-            aims = _Aim(jnp.asarray(prices / bounds, vectors.dtype), jnp.asarray(supplies, vectors.dtype))
-            slope, spent = self._gradient(vectors, aims, self._judge.starts(plan.batch, BATCH, step))
+            aims = Aim(jnp.asarray(prices / bounds, vectors.dtype), jnp.asarray(supplies, vectors.dtype))
+            slope, spent = self.gradient(vectors, aims, self._judge.starts(plan.batch, BATCH, step))
             grown = prices * np.exp(plan.price_rate * (np.asarray(spent) / bounds - 1.0))
             prices = np.where(prices > 0.0, np.clip(grown, plan.price / plan.dearest, plan.price * plan.dearest), 0.0)
             vectors, state = descent.step(self._optimiser, vectors, state, slope)
-            self.steps += len(jobs) * plan.batch * (round(plan.duration / plan.dt) + self._spare)
+            each = plan.batch * self.steps_of_a_run
+            self.steps.update({supply: each * int(np.sum(supplies == supply)) for supply in met})
             if (step + 1) % plan.judge_every == 0 or step + 1 == plan.steps:
                 times = np.full(len(jobs), np.inf)
                 for supply in met:
                     rows = np.flatnonzero(supplies == supply)
                     judged = self._judge.judge(np.asarray(vectors)[rows], supply, plan.judging, JUDGE)
                     met[supply] = together([met[supply], judged])
-                    kept = (judged.success >= np.max(met[supply].success)) & np.all(
-                        judged.costs <= bounds[rows], axis=1
-                    )
+                    well = judged.success >= met[supply].enough(plan.success)
+                    kept = well & np.all(judged.costs <= bounds[rows], axis=1)
                     times[rows] = np.where(kept, judged.time, np.inf)
                 if step + 1 >= plan.exchange_from * plan.steps:
-                    better = [met[supply].fastest(cost, bound) for supply, cost, bound in jobs]
+                    better = [met[supply].fastest(cost, bound, plan.success) for supply, cost, bound in jobs]
                     jump = np.array([time < 0.98 * now for (_, time), now in zip(better, times, strict=True)])
                     vectors = jnp.where(jump[:, None], np.stack([vector for vector, _ in better]), vectors)
                     state = jax.tree.map(functools.partial(_forgotten, rows=jump), state)
-            report(step + 1, plan.steps, f"{len(jobs)} tunings side by side")
+            report(step + 1, f"{len(jobs)} tunings side by side")
         return met
 
-    def _slope(self, vector: jax.Array, aim: _Aim, starts: State) -> tuple[jax.Array, jax.Array]:
+    def _slope(self, vector: jax.Array, aim: Aim, starts: State) -> tuple[jax.Array, jax.Array]:
         """Of the mean over the starts, no start's sensitivity drowning the others'; and the mean costs."""
         plan, plant, free = self._plan, self._judge.plant_at(aim.supply), self._judge.free_at(aim.supply)
-        terms = (TimeOutside(plan.width, plan.width), Effort(), Travel(), Jerkiness(), Unfinished(plan.duration))
+        costs = (FOLDS[cost] for cost in COSTS)
+        terms = (TimeOutside(plan.width, plan.width), *costs, Unfinished(plan.duration))
         fold = PricedTime(terms, tuple(aim.prices), plan.fine)
 
         def objective(vector: jax.Array, start: State) -> tuple[jax.Array, tuple[jax.Array, ...]]:
@@ -232,11 +245,11 @@ class _Tracer:
             )
             return found
 
-        slopes, costs = jax.vmap(jax.grad(objective, has_aux=True), in_axes=(None, 0))(vector, starts)
+        slopes, spent = jax.vmap(jax.grad(objective, has_aux=True), in_axes=(None, 0))(vector, starts)
         sound = jnp.all(jnp.isfinite(slopes), axis=1)
         slopes = jnp.where(sound[:, None], slopes, 0.0)
         slope = jnp.mean(descent.shortened(slopes, sound, plan.clip)[:, None] * slopes, axis=0)
-        return slope, jnp.mean(jnp.nan_to_num(jnp.stack(costs, axis=1)), axis=0)
+        return slope, jnp.mean(jnp.nan_to_num(jnp.stack(spent, axis=1)), axis=0)
 
 
 def _forgotten(leaf: jax.Array, rows: Numbers) -> jax.Array:

@@ -2,11 +2,15 @@
 
 import dataclasses
 import math
+from typing import TypeAlias
 
 from cpjax.errors import InputError
 
 COSTS = ("effort", "cart_travel", "voltage_variation")
 """Of `Metrics`, against the settling time."""
+
+Lane: TypeAlias = tuple[float, str]
+"""A supply [V] and a cost."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -15,10 +19,10 @@ class FrontPlan:
 
     Attributes:
       seed: of everything random. Starts are never those that a seed names for `cpjax.sample_starts`.
-      bounds: of the ladder, for each cost and supply; from `lowest` times the least cost among the candidates
-        geometrically to the cost of the fastest; and one more tuning without a bound.
+      bounds: tunings for each cost and supply, each with a bound on the cost, from `lowest` times the least cost among
+        the candidates geometrically to the cost of the fastest; and one more without a bound.
       lowest: see there.
-      fine: what a second costs that a stopped run leaves undone, beyond itself [s/s].
+      fine: what a second costs that a stopped run leaves undone, beyond itself [1].
       price: of a bound's worth of a cost, at first [s].
       price_rate: the price grows by exp(price_rate (cost / bound - 1)) in each step.
       dearest: it stays between `price` / `dearest` and `price` times `dearest`.
@@ -81,9 +85,12 @@ class FrontPlan:
                     raise InputError(field.name, value, f"a whole number, at least {least}")
             elif isinstance(value, (bool, str)) or not 0.0 < value < math.inf:
                 raise InputError(field.name, value, "a finite number above 0")
-        if self.lowest >= 1.0:
-            raise InputError("lowest", self.lowest, "above 0 and below 1")
-        if not self.dearest >= 1.0:
+        for name, largest in (("lowest", 0.999), ("success", 1.0), ("exchange_from", 1.0)):
+            if getattr(self, name) > largest:
+                raise InputError(name, getattr(self, name), f"above 0 and at most {largest:g}")
+        if self.dearest < 1.0:
             raise InputError("dearest", self.dearest, "at least 1")
-        if self.success > 1.0:
-            raise InputError("success", self.success, "above 0 and at most 1")
+        for whole, part in (("duration", "dt"), ("horizon", "judging_dt"), ("horizon", "final_dt")):
+            steps = getattr(self, whole) / getattr(self, part)
+            if steps < 0.5 or abs(steps - round(steps)) > 1e-6 * steps:
+                raise InputError(part, getattr(self, part), f"a whole fraction of {whole}, {getattr(self, whole):g} s")
