@@ -11,7 +11,7 @@ report: .venv/ready  ## the main job: the paper's controllers, reproduced, as on
 	$(BIN)/cpjax report --out $(OUT)/report
 
 report-full: .venv/ready  ## the same with finer maps and full fronts: some fifteen minutes
-	$(BIN)/cpjax report --count 10000 --cells 512 --studies full --out $(OUT)/report
+	$(BIN)/cpjax report --count 10000 --cells 512 --studies full --out $(OUT)/report-full
 
 test: check  ## linter, type checker, tests with warnings as errors
 	$(BIN)/python -m pytest -n 2 --dist worksteal

@@ -51,7 +51,7 @@ def view(browser: str, page: Path, picture: Path, width: int, *, dark: bool) -> 
         size = [f"--window-size={width},{HEIGHT}", f"--blink-settings=preferredColorScheme={0 if dark else 1}"]
         files = [f"--log-net-log={net}", f"--user-data-dir={folder}/profile", f"--screenshot={picture}"]
         command = [browser, *OPTIONS, *size, *files, page.resolve().as_uri()]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=180, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=180, check=True)
         requests = [event.get("params", {}) for event in json.loads(net.read_text())["events"]]
     said = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
     with Image.open(picture) as image:
@@ -81,7 +81,8 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
     if browser is None:
         raise SystemExit("none of these is on the path: " + ", ".join(BROWSERS))
     out.mkdir(parents=True, exist_ok=True)
-    cli.main(["animate", "--format", "html", "--seed", str(seed), "--out", str(out)])
+    if cli.main(["animate", "--format", "html", "--seed", str(seed), "--out", str(out)]) != 0:
+        raise SystemExit("cpjax animate failed")
     pages = [out / "animation.html"]
     if not quick:
         pages.append(Path("out/report/report.html"))

@@ -47,4 +47,6 @@ def test_its_python_runs(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     text = (DOCS / f"{page}.md").read_text()
     exec(compile("\n".join(re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)), page, "exec"), {})
-    assert "nan" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "nan" not in printed
+    assert "inf" not in printed

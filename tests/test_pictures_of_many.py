@@ -53,6 +53,44 @@ def test_an_animation_as_a_page_holds_the_runs_and_asks_for_nothing(command, tmp
     np.testing.assert_allclose(data["scenes"][1]["voltage"], np.asarray(run.voltage)[::25], atol=1e-3)
 
 
+def test_a_gif_keeps_time_and_has_the_colours_of_what_comes_later(command, tmp_path):
+    # As printed, and from rest, the law asks for nothing at first: no green bar in the first picture.
+    arguments = ("--controllers", "as-printed/lqr", "tuned_lqr", "--theta", 2.8, "--duration", 1, "--rate", 30)
+    assert command("animate", *arguments, "--out", tmp_path).code == 0
+    shown, greenest = 0, 999
+    with Image.open(tmp_path / "animation.gif") as picture:
+        for i in range(picture.n_frames):
+            picture.seek(i)
+            shown += picture.info["duration"]
+            pixels = np.asarray(picture.convert("RGB"), int)
+            greenest = min(greenest, np.min(np.abs(pixels - [0, 0x9E, 0x73]).sum(axis=2)))
+    assert abs(shown - 1000 * 31 / 30) <= 5
+    assert greenest < 40
+
+
+@pytest.mark.parametrize(
+    ("script", "code", "words"),
+    [
+        ('for last; do :; done; cat > "$last"', 0, "animation.mp4"),
+        ("echo no such codec >&2; exit 3", 2, "no such codec"),
+    ],
+)
+def test_a_film_is_what_the_encoder_makes_of_the_pictures_or_what_it_says(
+    script, code, words, command, tmp_path, monkeypatch
+):
+    program = tmp_path / "encoder"
+    program.write_text(f"#!/bin/bash\n{script}\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(animation, "encoder", lambda: str(program))
+    done = command("animate", "--format", "mp4", "--duration", 0.2, "--rate", 10, "--out", tmp_path / "film")
+    assert done.code == code
+    assert words in done.out + done.err
+    film = tmp_path / "film" / "animation.mp4"
+    assert film.exists() == (code == 0)
+    if code == 0:  # the stub writes down what it was given: three pictures
+        assert film.stat().st_size % 9 == 0
+
+
 def test_without_an_encoder_a_film_becomes_a_page(command, tmp_path, monkeypatch):
     monkeypatch.setattr(animation, "encoder", lambda: None)
     done = command("animate", "--format", "mp4", "--duration", 0.1, "--out", tmp_path)
@@ -64,7 +102,10 @@ def test_without_an_encoder_a_film_becomes_a_page(command, tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("basin", "--theta", "1", "-1"), "high"),
+        (("basin", "--theta", "1", "-1"), "error: theta = "),
+        (("basin", "--theta-dot", "nan", "1"), "error: theta-dot = "),
+        (("animate", "--controllers", "tuned_lqr", "tuned_lqr"), "controllers"),
+        (("animate", "--rate", "60"), "rate"),
         (("basin", "--across", "x", "--up", "x"), "up"),
         (("basin", "--cells", "0"), "cells"),
         (("basin", "--controllers", "corrected/nothing"), "controller"),
@@ -98,7 +139,12 @@ def test_pareto_keeps_a_finished_design_when_it_is_stopped(command, tmp_path, mo
         assert command("pareto", *small).code == 130
     parts = sorted(tmp_path.glob("*.part.json"))
     assert len(parts) == 2
-    assert command("pareto", *small).code == 0
+    other = command("pareto", *small, "--seed", 2)
+    assert other.code == 2
+    assert "out = " in other.err
+    with monkeypatch.context() as patch:
+        patch.setattr("cpjax.study.front.trace_fronts", stop)  # nothing is traced again
+        assert command("pareto", *small).code == 0
     assert not list(tmp_path.glob("*.part.json"))
     document = json.loads((tmp_path / "pareto.json").read_text())
     assert {row["cost"] for row in document["fronts"]["lqr"]["rows"]} == {"effort", "cart_travel", "voltage_variation"}

@@ -1,16 +1,18 @@
 """`cpjax tune` and `cpjax compare`, called as functions, and the tuned controllers that ship."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import cpjax
 from cpjax import io, paper
+from cpjax.cli.compare import representative_start
 from cpjax.controllers import LqrWeights, PoleFactors
 from cpjax.errors import InputError
 from cpjax.presets import preset
-from cpjax.show.comparison import phase_portraits
+from cpjax.show.comparison import findings, phase_portraits
 from cpjax.study.comparison import DESIGNS, Compared, Entry, best, compare, entries
 from cpjax.study.reproduction import Setting
 from cpjax.tune import tuner
@@ -141,11 +143,34 @@ def test_compare_writes_its_table_and_pictures(tmp_path, command):
     assert {path.name for path in tmp_path.iterdir()} == {"compare.json", *pictures}
 
 
+def test_a_comparison_in_which_nothing_settles_says_so_without_figures():
+    results = compare(PLANT, entries(PLANT), Setting(count=2, duration=1.5, dt=0.005))[1]
+    for sentence in findings(results):
+        assert "catches none of the starts" in sentence
+        assert "nan" not in sentence
+
+
+def test_the_start_that_is_shown_is_the_first_that_all_catch_and_says_so():
+    starts = cpjax.sample_starts("hanging", 3, seed=1)
+
+    def one(*success):
+        return SimpleNamespace(metrics=SimpleNamespace(success=np.array(success)))
+
+    start, words = representative_start(starts, [one(True, True, True), one(False, False, True)])
+    assert start.theta == float(starts.theta[2])
+    assert words.startswith("number 3 of 3")
+    start, words = representative_start(starts, [one(True, False, False), one(False, True, True)])
+    assert start.theta == float(starts.theta[0])
+    assert "no start is caught by all" in words
+
+
 def test_the_phase_portrait_shows_the_run_and_the_gate_where_the_controller_has_it():
     controller = preset("lqr")
     run = cpjax.rollout(PLANT, controller, cpjax.HANGING, duration=4.0, dt=0.005, clock="sampled")
     one = Compared(Entry("tuned", "lqr", "tuned", controller), run.metrics, {})
-    figure = phase_portraits(PLANT, {(kind, design): (one, run) for kind in ("paper", "tuned") for design in DESIGNS})
+    figure = phase_portraits(
+        PLANT, {(kind, design): (one, run) for kind in ("paper", "tuned") for design in DESIGNS}, ""
+    )
     swing_up, regulating, start = figure.axes[0].lines
     theta, rate = np.concatenate([np.stack(line.get_data()) for line in (swing_up, regulating)], axis=1)
     drawn = np.isfinite(theta) & np.isfinite(rate)

@@ -5,8 +5,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from cpjax import io
 from cpjax.cli.options import (
     PLANT_OPTIONS,
@@ -26,7 +24,7 @@ from cpjax.sim.rollout import Trajectory, rollout
 from cpjax.state import State
 
 CONTROLLERS = ("corrected/lqr", "tuned_lqr")
-_FORMATS = ("gif", "mp4", "html")
+FORMATS = ("gif", "mp4", "html")
 
 OPTIONS = [
     Option(
@@ -36,9 +34,9 @@ OPTIONS = [
         "as-printed/placement (default " + " ".join(CONTROLLERS) + ")",
         count="+",
     ),
-    Option("animation", "format", "(default gif; mp4 needs ffmpeg, and is html without it)", choices=_FORMATS),
+    Option("animation", "format", "(default gif; mp4 needs ffmpeg, and is html without it)", choices=FORMATS),
     Option("animation", "duration", "shown [s] (default 6)", float),
-    Option("animation", "rate", "pictures per second (default 20)", float),
+    Option("animation", "rate", "pictures per second, for a GIF at most 50 (default 20)", float),
     *START_OPTIONS,
     *PLANT_OPTIONS,
 ]
@@ -62,12 +60,15 @@ def run(given: argparse.Namespace) -> int:
     chosen = {"controllers": list(CONTROLLERS), "format": "gif", "duration": 6.0, "rate": 20.0, **sections["animation"]}
     if not 0.0 < chosen["duration"] <= 600.0:
         raise InputError("duration", chosen["duration"], "above 0 and at most 600 s")
-    controllers = {name: named_hybrid(name, plant) for name in chosen["controllers"]}
+    names = chosen["controllers"]
+    if len(set(names)) < len(names):
+        raise InputError("controllers", names, "each one once")
+    controllers = {name: named_hybrid(name, plant) for name in names}
     start = build_start(sections["start"], given.seed)
     path, runs = animated(given.out, plant, controllers, start, chosen, seed=given.seed)
     for name, one in runs.items():
-        time = float(one.metrics.settling_time)
-        print(f"{name}: " + (f"settles after {time:.2f} s" if np.isfinite(time) else "does not settle in this time"))
+        settled = f"settles after {float(one.metrics.settling_time):.2f} s"
+        print(f"{name}: {settled if bool(one.metrics.success) else 'does not settle in this time'}")
     print(f"wrote {path} and animation.json")
     return 0
 
@@ -113,6 +114,7 @@ def animated(
         "runs": {
             name: {
                 "controller": io.encode(controllers[name]),
+                "success": bool(one.metrics.success),
                 "settling_time": float(one.metrics.settling_time),
                 "cart_travel": float(one.metrics.cart_travel),
                 "effort": float(one.metrics.effort),

@@ -19,7 +19,7 @@ from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.sim.metrics import Metrics
 from cpjax.state import NAMES, UNITS
-from cpjax.study.basin import Axis, Map, area, document
+from cpjax.study.basin import MOST_CELLS, Axis, Map, area, document
 from cpjax.study.design_check import DesignCheck, check_design
 from cpjax.study.recording import record_sweep
 
@@ -74,8 +74,8 @@ def run(given: argparse.Namespace) -> int:
     plant = build_plant(sections["plant"])
     chosen = dict(sections["map"])
     names = chosen.pop("controllers", list(CONTROLLERS))
-    if len(set(names)) < len(names):
-        raise InputError("controllers", names, "each one once")
+    if len({file_of(name) for name in names}) < len(names):
+        raise InputError("controllers", names, "each one once, and with names that differ in more than their endings")
     controllers = {name: named_hybrid(name, plant) for name in names}
     setting = {"duration": 10.0, "dt": 0.002, **sections["run"]}
     begin = time.perf_counter()
@@ -120,9 +120,15 @@ def drawn(
 def chart_of(chosen: dict[str, Any], seed: int) -> Map:
     """The map that the options describe."""
 
+    cells = chosen.get("cells", 512)
+    if not 2 <= cells <= MOST_CELLS:
+        raise InputError("cells", cells, f"a whole number from 2 to {MOST_CELLS}")
+
     def axis(name: str) -> Axis:
         low, high = chosen.get(name) or _RANGES[name]
-        return Axis(name, low, high, chosen.get("cells", 512))
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise InputError(name.replace("_", "-"), (low, high), "two finite numbers, the lower one first")
+        return Axis(name, low, high, cells)
 
     across, up = axis(chosen.get("across", "theta")), axis(chosen.get("up", "theta_dot"))
     others = {name: tuple(chosen[name]) for name in NAMES if name in chosen and name not in (across.name, up.name)}
@@ -131,7 +137,7 @@ def chart_of(chosen: dict[str, Any], seed: int) -> Map:
 
 def file_of(name: str) -> str:
     """Of a controller's runs."""
-    return name.replace("/", "-").removesuffix(".json").removesuffix(".toml") + ".npz"
+    return name.replace("/", "-").removesuffix(".json").removesuffix(".toml").lstrip(".-") + ".npz"
 
 
 def mapped(out: Path, plant: CartPole, chart: Map, name: str, controller: Hybrid, setting: dict[str, Any]) -> Metrics:

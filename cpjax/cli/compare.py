@@ -47,12 +47,12 @@ def run(given: argparse.Namespace) -> int:
     files = dict(sections["tuned"])
     limit = files.pop("track_limit", float("inf"))
     tuned = {design: _loaded(design, files[design]) for design in DESIGNS if design in files}
-    results = compared(given.out, plant, setting, tuned, limit)
+    results, shown_start = compared(given.out, plant, setting, tuned, limit)
 
     from cpjax.show.comparison import findings
 
     print_results(results)
-    print(*findings(results), sep="\n")
+    print(*findings(results), f"responses.png and phase.png show start {shown_start}.", sep="\n")
     print(f"wrote {given.out / 'compare.json'} and the pictures beside it")
     return 0
 
@@ -63,8 +63,10 @@ def compared(
     setting: Setting,
     tuned: Mapping[paper.Design, Hybrid],
     track_limit: float = float("inf"),
-) -> list[Compared]:
-    """The comparison, with its JSON and pictures written; `tuned` by design, what is missing from the presets."""
+) -> tuple[list[Compared], str]:
+    """The comparison, with its JSON and pictures written, and which start the pictures of one run show; `tuned` is by
+    design, what is missing from the presets.
+    """
     chosen = entries(plant, tuned)
     with progress("compare") as report:
         starts, results = compare(plant, chosen, setting, track_limit=track_limit, progress=report)
@@ -73,8 +75,9 @@ def compared(
         for kind in ("paper", "tuned")
         for design in DESIGNS
     }
-    start = representative_start(starts, list(best_ones.values()))
-    described = document(plant, results, setting, track_limit=track_limit, shown_start=io.encode(start))
+    start, chosen_because = representative_start(starts, list(best_ones.values()))
+    shown_start = {"state": io.encode(start), "is": chosen_because}
+    described = document(plant, results, setting, track_limit=track_limit, shown_start=shown_start)
     io.write_json(out / "compare.json", described)
 
     from cpjax.show.comparison import by_start, phase_portraits, responses
@@ -82,19 +85,23 @@ def compared(
 
     how: dict[str, Any] = {"duration": setting.duration, "dt": setting.dt, "clock": "sampled"}
     shown = {key: (one, rollout(plant, one.entry.controller, start, **how)) for key, one in best_ones.items()}
-    times = [float(run.metrics.settling_time) for _, run in shown.values()]
-    until = min(setting.duration, 1.1 * max((time for time in times if np.isfinite(time)), default=setting.duration))
-    save_figure(out / "responses.png", responses(shown, until, float(plant.motor.voltage_limit)))
-    save_figure(out / "phase.png", phase_portraits(plant, shown))
+    times = [float(run.metrics.settling_time) for _, run in shown.values() if bool(run.metrics.success)]
+    until = min(setting.duration, 1.1 * max(times, default=setting.duration)) or setting.duration
+    title = f"start {chosen_because}"
+    save_figure(out / "responses.png", responses(shown, until, float(plant.motor.voltage_limit), title))
+    save_figure(out / "phase.png", phase_portraits(plant, shown, title))
     save_figure(out / "by_start.png", by_start(starts, results))
-    return results
+    return results, chosen_because
 
 
-def representative_start(starts: State, shown: Sequence[Compared]) -> State:
-    """The first start that all of these catch, or else the first one."""
+def representative_start(starts: State, shown: Sequence[Compared]) -> tuple[State, str]:
+    """The first start that all of these catch, or else the first one; and which of the two it is."""
     caught = np.all([np.asarray(one.metrics.success) for one in shown], axis=0)
     index = int(np.argmax(caught))
-    return State(*(float(np.asarray(getattr(starts, name))[index]) for name in NAMES))
+    start = State(*(float(np.asarray(getattr(starts, name))[index]) for name in NAMES))
+    if not caught[index]:
+        return start, f"the first of {len(caught)}: no start is caught by all that are shown"
+    return start, f"number {index + 1} of {len(caught)}, the first that all catch that are shown"
 
 
 def print_results(results: list[Compared]) -> None:

@@ -7,6 +7,7 @@ from cpjax import __version__
 from cpjax.cli.options import EVALUATION_OPTIONS, Option, add_options, resolve
 from cpjax.cli.reproduce import print_rows, rows_of
 from cpjax.errors import InputError
+from cpjax.study.basin import MOST_CELLS
 from cpjax.study.reproduction import Setting
 
 OPTIONS = [
@@ -36,8 +37,8 @@ def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
     chosen = sections["report"]
-    if not 0 <= chosen.get("cells", 256) <= 4096 or chosen.get("cells") == 1:
-        raise InputError("cells", chosen["cells"], "0, or a whole number from 2 to 4096")
+    if not 0 <= chosen.get("cells", 256) <= MOST_CELLS or chosen.get("cells") == 1:
+        raise InputError("cells", chosen["cells"], f"0, or a whole number from 2 to {MOST_CELLS}")
     setting = Setting(seed=given.seed, **sections["evaluation"])
     rows = rows_of(given, setting)
 

@@ -17,6 +17,7 @@ from cpjax.presets import preset
 from cpjax.show import comparison as comparison_text
 from cpjax.show import design as design_text
 from cpjax.show import forensics as forensics_text
+from cpjax.show import front as front_text
 from cpjax.show import gradients as gradients_text
 from cpjax.show.figures import DESIGN_NAMES, png, save_figure
 from cpjax.show.page import Page
@@ -110,8 +111,8 @@ def gradients(page: Page, given: argparse.Namespace) -> None:
         page.text(sentence)
     page.picture(
         (given.out / "audit_gradients.png").read_bytes(),
-        "Located gradients agree with finite differences at every horizon; plain ones are wrong as soon as a run has "
-        "crossed the gate.",
+        "Left and middle: how far derivatives are from finite differences, with located switches and plainly, by the "
+        "length of the run and by how slowly it crossed the gate. Right: how a change of the start grows.",
     )
     page.table(gradients_text.header(audit), gradients_text.cells(audit), text_columns=1)
     page.note(gradients_text.TITLE + ". Every number stands in `audit_gradients.json`.")
@@ -133,8 +134,8 @@ def tuning(page: Page, given: argparse.Namespace, size: str) -> None:
         found = tuned(folder, plant, free, plan)
         page.picture(
             (folder / "tune.png").read_bytes(),
-            f"{DESIGN_NAMES[design]}: the restarts (grey) and the best of them (blue) settle ever faster, and from "
-            "more starts, as gradients move them.",
+            f"{DESIGN_NAMES[design]}: settling time and share of starts of each restart (grey), and of the one that is "
+            "best by then (blue), over the steps of the optimiser.",
         )
         rows.append(
             [
@@ -157,7 +158,7 @@ def tuning(page: Page, given: argparse.Namespace, size: str) -> None:
 
 def comparison(page: Page, given: argparse.Namespace, setting: Setting) -> None:
     """The paper's controllers beside the tuned ones."""
-    results = compared(given.out, paper.appendix_plant(), setting, {})
+    results, start = compared(given.out, paper.appendix_plant(), setting, {})
 
     page.section("Against tuned gains")
     page.text(
@@ -171,12 +172,12 @@ def comparison(page: Page, given: argparse.Namespace, setting: Setting) -> None:
     page.note("Means over the successful runs. Every number stands in `compare.json` beside this page.")
     page.picture(
         (given.out / "responses.png").read_bytes(),
-        "From one start: the best of the paper's controllers pumps for many swings; the tuned ones push and pull once.",
+        f"Angle, cart and voltage under the best of the paper's controllers and the tuned ones, from start {start}.",
     )
     page.picture(
         (given.out / "phase.png").read_bytes(),
-        "The same runs over angle and rate: the paper's swing-up nears the energy of upright (dashed) swing by swing; "
-        "the tuned one is there after a single reversal, and its regulator takes over far from upright.",
+        "The same runs over angle and rate: a swing-up succeeds where it brings the pendulum to the energy of upright "
+        "(dashed) and into the gate (orange), where the regulator takes over (thick).",
     )
     page.picture(
         (given.out / "by_start.png").read_bytes(),
@@ -189,12 +190,19 @@ def animation(page: Page, given: argparse.Namespace) -> None:
     plant = paper.appendix_plant()
     names = {"corrected/lqr": "paper, corrected, LQR", "tuned_lqr": "tuned, LQR"}
     controllers = {words: named_hybrid(name, plant) for name, words in names.items()}
-    path, _ = animated(
+    path, runs = animated(
         given.out, plant, controllers, HANGING, {"format": "gif", "duration": 6.0, "rate": 20.0}, seed=given.seed
     )
     page.picture(
         path.read_bytes(),
-        "Six seconds from rest: the paper's controller is still pumping when the tuned one has long stood upright.",
+        "Six seconds from rest, in real time: "
+        + "; ".join(
+            f"{name} stands after {float(run.metrics.settling_time):.2f} s"
+            if bool(run.metrics.success)
+            else f"{name} does not stand by then"
+            for name, run in runs.items()
+        )
+        + ".",
         kind="gif",
     )
 
@@ -212,8 +220,8 @@ def basins(page: Page, given: argparse.Namespace, cells: int) -> None:
     )
     page.picture(
         (given.out / "basin.png").read_bytes(),
-        "The paper's controllers catch what comes along a narrow band; the tuned ones bring most of the plane to rest. "
-        "The level set that the linear model certifies, in pink, is a speck of what works.",
+        "Settling time (above) and changes of mode (below) by where a run begins, grey where it does not settle; in "
+        "orange the gate, dashed where the regulator asks for the whole supply, pink what the linear model certifies.",
     )
     page.table(header, rows, text_columns=1)
     page.note("Every number stands in `basin.json`, every run in the files that it names; `cpjax basin` draws others.")
@@ -232,14 +240,15 @@ def fronts(page: Page, given: argparse.Namespace, size: str) -> None:
     )
     page.picture(
         (given.out / "pareto.png").read_bytes(),
-        "Down and left is better: tuned by gradients, both methods reach fronts that the same work of random search "
-        "does not, and the two methods lie close together.",
+        "Down and left is better: what gradients reach (filled) and what random search reaches with as much work "
+        "(crosses); stars are where the search began, hollow marks the paper's controllers and the shipped ones.",
     )
     page.picture(
         (given.out / "supplies.png").read_bytes(),
-        "Settling time against effort at other supplies: with more voltage both methods settle faster, with less they "
-        "need more swings, or find no catch.",
+        "Settling time against effort, one panel for each supply.",
     )
+    for sentence in front_text.findings(pareto.curves_of(found)):
+        page.text(sentence)
     _, header, rows = pareto.table(found)
     page.table(header, rows, text_columns=2)
     for sentence in pareto.costs(found):

@@ -1,4 +1,4 @@
-"""`cpjax tune`: a controller tuned by gradients through swing-ups; a file that every other command takes."""
+"""`cpjax tune`: a controller tuned by gradients through swing-ups; a file for `--controller` of others."""
 
 import argparse
 import dataclasses

@@ -40,6 +40,24 @@ def two_proportion_p_value(successes_a: int, trials_a: int, successes_b: int, tr
     return 2 * NormalDist().cdf(-abs(z))
 
 
+def mcnemar_p_value(only_a: int, only_b: int) -> float:
+    """p-value of McNemar's exact two-sided test: two ways to treat the same subjects (McNemar, 1947).
+
+    Args:
+      only_a: how many succeeded under the first alone.
+      only_b: and under the second alone.
+
+    Raises:
+      InputError: a count below 0.
+    """
+    _check_counts(only_a, only_a + only_b or 1)
+    total, fewer = only_a + only_b, min(only_a, only_b)
+    # P(at most `fewer` heads in `total` fair tosses), its terms by logarithms: they may be far below 1e-308.
+    logs = [math.lgamma(total + 1) - math.lgamma(k + 1) - math.lgamma(total - k + 1) for k in range(fewer + 1)]
+    tail = math.fsum(math.exp(log - total * math.log(2.0)) for log in logs)
+    return min(1.0, 2.0 * tail)
+
+
 def _check_counts(successes: int, trials: int) -> None:
     if isinstance(trials, bool) or not isinstance(trials, int) or not 1 <= trials <= _MOST:
         raise InputError("trials", trials, f"a whole number, at least 1 and at most {_MOST}")

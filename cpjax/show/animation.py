@@ -1,8 +1,10 @@
 """A run, or several side by side, as a moving picture: GIF, MP4, or a page of HTML that needs nothing else."""
 
+import contextlib
 import io as buffers
+import itertools
 import json
-import os
+import math
 import shutil
 import subprocess
 import tempfile
@@ -26,6 +28,8 @@ from cpjax.sim.rollout import Trajectory
 FORMATS = ("gif", "mp4", "html")
 _TRAIL = 0.6  # seconds of the tip's path that stay visible
 _COLOURS = 64  # of a GIF
+_FASTEST_GIF = 50.0  # pictures per second: browsers slow down what is faster
+_MOST_PICTURES = 1500  # of a GIF: they are all in memory
 
 Report = Callable[[int, int, str], None]
 
@@ -66,15 +70,20 @@ def save_animation(
         raise InputError("scenes", len(scenes), "at least one")
     if not 0.0 < rate <= 100.0:
         raise InputError("rate", rate, "above 0 and at most 100 pictures per second")
+    if kind == "gif" and rate > _FASTEST_GIF:
+        raise InputError("rate", rate, f"above 0 and at most {_FASTEST_GIF:g} pictures per second for a GIF")
     longest = min(float(scene.trajectory.time[-1]) for scene in scenes)
     if not 1.0 / rate <= duration <= longest * (1.0 + 1e-9):
         raise InputError("duration", duration, f"at least one picture, and at most the runs' {longest:g} s")
+    if kind == "gif" and duration * rate > _MOST_PICTURES:
+        allowed = f"at most {_MOST_PICTURES / rate:g} s for a GIF at this rate, {_MOST_PICTURES} pictures"
+        raise InputError("duration", duration, allowed)
     if kind == "html":
         io.write_text(path, page(scenes, duration, rate))
     elif kind == "gif":
         io.write_bytes(path, _gif(_pictures(scenes, duration, rate, report), rate))
     else:
-        _write_mp4(path, _pictures(scenes, duration, rate, report), rate)
+        io.write_bytes(path, _mp4(_pictures(scenes, duration, rate, report), rate))
 
 
 def page(scenes: Sequence[Scene], duration: float, rate: float) -> str:
@@ -100,7 +109,7 @@ def page(scenes: Sequence[Scene], duration: float, rate: float) -> str:
 
 def _sampled(run: Trajectory, duration: float, rate: float) -> tuple[np.ndarray[Any, Any], ...]:
     """x, theta, voltage and mode at each picture."""
-    instants = np.arange(round(duration * rate) + 1) / rate
+    instants = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
     at = np.clip(np.searchsorted(np.asarray(run.time), instants - 1e-9), 0, len(run.time) - 1)
     return tuple(np.asarray(column)[at] for column in (run.state.x, run.state.theta, run.voltage, run.mode))
 
@@ -184,40 +193,55 @@ def _pictures(scenes: Sequence[Scene], duration: float, rate: float, report: Rep
 
 
 def _gif(pictures: Iterator[Image.Image], rate: float) -> bytes:
-    first = next(pictures)
-    palette = first.quantize(_COLOURS)
-    frames = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    every = list(pictures)
+    # The colours of pictures from beginning to end: one alone may lack what moves in later.
+    few = every[:: max(1, len(every) // 8)]
+    sheet = Image.new("RGB", (few[0].width, few[0].height * len(few)))
+    for i, picture in enumerate(few):
+        sheet.paste(picture, (0, i * picture.height))
+    palette = sheet.quantize(_COLOURS)
+    first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in every)
+    # A GIF counts hundredths of a second: rounded so that the film as a whole keeps time.
+    ends = np.round(100.0 * np.arange(len(every) + 1) / rate).astype(int)
     buffer = buffers.BytesIO()
-    milliseconds = max(10, 10 * round(100.0 / rate))  # a GIF counts hundredths of a second
-    palette.save(
-        buffer, "GIF", save_all=True, append_images=frames, duration=milliseconds, loop=0, optimize=True, disposal=1
+    first.save(
+        buffer,
+        "GIF",
+        save_all=True,
+        append_images=others,
+        duration=(10 * np.diff(ends)).tolist(),
+        loop=0,
+        optimize=True,
+        disposal=1,
     )
     return buffer.getvalue()
 
 
-def _write_mp4(path: Path, pictures: Iterator[Image.Image], rate: float) -> None:
+def _mp4(pictures: Iterator[Image.Image], rate: float) -> bytes:
     program = encoder()
     if program is None:
-        raise InputError("path", str(path), "a .gif or .html file: there is no ffmpeg to make an .mp4")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(suffix=".mp4", dir=path.parent)
-    os.close(handle)
-    try:
+        raise InputError("path", "an .mp4", "a .gif or .html file: there is no ffmpeg to make an .mp4")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "film.mp4"
         first = next(pictures)
-        size = f"{first.width}x{first.height}"
-        command = [program, "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size]
-        command += ["-r", str(rate), "-i", "-", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", name]
-        with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
-            assert process.stdin is not None
-            process.stdin.write(first.tobytes())
-            for picture in pictures:
-                process.stdin.write(picture.tobytes())
-            process.stdin.close()
-            if process.wait():
-                raise OSError(f"{program} failed with exit code {process.returncode}")
-        os.replace(name, path)
-    finally:
-        Path(name).unlink(missing_ok=True)
+        raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.width}x{first.height}", "-r", str(rate)]
+        even = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]  # what most players want
+        command = [program, "-y", "-loglevel", "error", *raw, "-i", "-", *even, str(path)]
+        with open(Path(folder) / "said", "w+b") as log:
+            with (  # a broken pipe: it has stopped before its time, and says why
+                contextlib.suppress(BrokenPipeError),
+                subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log) as process,
+            ):
+                assert process.stdin is not None
+                for picture in itertools.chain([first], pictures):
+                    process.stdin.write(picture.tobytes())
+            log.seek(0)
+            said = log.read().decode(errors="replace").strip()
+        code = process.returncode
+        if code or not path.exists():
+            allowed = f"gif or html: {program} ended with exit code {code}, saying {said or 'nothing'}"
+            raise InputError("format", "mp4", allowed)
+        return path.read_bytes()
 
 
 _PAGE = """<!doctype html>

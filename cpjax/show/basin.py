@@ -75,7 +75,7 @@ def basins(chart: Map, panels: Sequence[Panel]) -> Figure:
         axes[1, column].set_xlabel(LABELS[chart.across.name])
     for row in range(2):
         axes[row, 0].set_ylabel(LABELS[chart.up.name])
-    figure.colorbar(drawn[0], ax=axes[0], label="settling time [s] (grey: fails)")
+    figure.colorbar(drawn[0], ax=axes[0], label="settling time [s] (grey: fails)", extend="max")
     bar = figure.colorbar(drawn[1], ax=axes[1], label="changes of mode", ticks=range(_MOST_SWITCHES + 1))
     bar.ax.set_yticklabels([*map(str, range(_MOST_SWITCHES)), f"{_MOST_SWITCHES}+"])
     names = ("gate", "regulator asks for the whole supply", "certified for the linear model")

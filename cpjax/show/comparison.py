@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from cpjax.controllers import REGULATE, SWING_UP, Hybrid
-from cpjax.numeric.statistics import two_proportion_p_value
+from cpjax.numeric.statistics import mcnemar_p_value
 from cpjax.numeric.trigonometry import wrap_angle
 from cpjax.plant import CartPole
 from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES
@@ -70,27 +70,31 @@ def findings(results: Sequence[Compared]) -> list[str]:
 def _answer(results: Sequence[Compared], *, tuned: bool) -> str:
     a, b = (best(results, design, tuned=tuned) for design in DESIGNS)
     kind = "Tuned" if tuned else "With the paper's gains and laws, the better of each"
-    p = two_proportion_p_value(a.summary["successes"], a.summary["count"], b.summary["successes"], b.summary["count"])
+    caught_by_a, caught_by_b = (np.asarray(one.metrics.success) for one in (a, b))
+    p = mcnemar_p_value(int(np.sum(caught_by_a & ~caught_by_b)), int(np.sum(caught_by_b & ~caught_by_a)))
     verdict = "a difference" if p < 1e-3 else "no difference at 99.9 %"
 
     def words(one: Compared) -> str:
         good = one.summary["over_successes"]
+        if not one.summary["successes"]:
+            return f"{DESIGN_NAMES[one.entry.design]} catches none of the starts"
         return (
             f"{DESIGN_NAMES[one.entry.design]} catches {100 * one.summary['success_rate']:.2f} % of the starts, "
             f"settles after {good['settling_time']['mean']:.2f} s, uses {good['cart_travel']['mean']:.2f} m and "
             f"{good['effort']['mean']:.0f} V^2 s, and moves the voltage by {good['voltage_variation']['mean']:.0f} V"
         )
 
-    return f"{kind}: {words(a)}; {words(b)} ({verdict} in success)."
+    return f"{kind}: {words(a)}; {words(b)} ({verdict} in success by McNemar's test)."
 
 
 Shown: TypeAlias = Mapping[tuple[str, str], tuple[Compared, Trajectory]]
 """By "paper" or "tuned" and design: a controller, and its run from the one start that is shown."""
 
 
-def responses(shown: Shown, until: float, limit: float) -> Figure:
+def responses(shown: Shown, until: float, limit: float, title: str) -> Figure:
     """Angle, cart and voltage of the paper's and the tuned controllers from one start, the designs side by side."""
     figure = Figure(figsize=(12, 8), layout="constrained")
+    figure.suptitle(title)
     axes = figure.subplots(3, 2, sharex=True, sharey="row")
     for column, design in enumerate(DESIGNS):
         for kind, style in (("paper", "--"), ("tuned", "-")):
@@ -111,13 +115,17 @@ def responses(shown: Shown, until: float, limit: float) -> Figure:
         axes[1, column].legend(frameon=False, loc="lower right")
     for row, label in enumerate((r"$\theta$, modulo a turn [rad]", "x [m]", "voltage [V]")):
         axes[row, 0].set_ylabel(label)
-    axes[1, 0].set_ylim(-2.0, 2.0)
+    low, high = axes[1, 0].get_ylim()
+    if max(-low, high) > 3.0:
+        axes[1, 0].set_ylim(max(low, -3.0), min(high, 3.0))
+        axes[1, 0].set_ylabel("x [m] (cut at 3 m)")
     return figure
 
 
-def phase_portraits(plant: CartPole, shown: Shown) -> Figure:
+def phase_portraits(plant: CartPole, shown: Shown, title: str) -> Figure:
     """Angle and rate of the whole runs, over the pendulum's energy and each controller's gate."""
     figure = Figure(figsize=(12, 9), layout="constrained")
+    figure.suptitle(title)
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     fastest = max(float(np.max(np.abs(np.asarray(run.state.theta_dot)))) for _, run in shown.values())
     per_lift = 4.0 * float(plant.pole_mass) * float(plant.gravity) * float(plant.pole_length)
@@ -183,13 +191,17 @@ def by_start(starts: State, results: Sequence[Compared]) -> Figure:
     figure = Figure(figsize=(12, 6.5), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     theta, rate = np.asarray(starts.theta), np.asarray(starts.theta_dot)
+    shown = [best(results, design, tuned=tuned).metrics for design in DESIGNS for tuned in (False, True)]
+    times = np.concatenate([np.asarray(one.settling_time)[np.asarray(one.success)] for one in shown])
+    low, high = (float(np.min(times)), float(np.max(times))) if times.size else (1.0, 10.0)
+    norm = LogNorm(max(low, 0.1), max(high, 1.01 * max(low, 0.1)))  # who begins settled has no logarithm
     drawn: Any = None
     for column, design in enumerate(DESIGNS):
         for row, tuned in enumerate((False, True)):
             one, panel = best(results, design, tuned=tuned), axes[row, column]
             good = np.asarray(one.metrics.success)
             time = np.asarray(one.metrics.settling_time)
-            drawn = panel.scatter(theta[good], rate[good], c=time[good], s=5, cmap="viridis", norm=LogNorm(1.5, 15.0))
+            drawn = panel.scatter(theta[good], rate[good], c=time[good], s=5, cmap="viridis", norm=norm)
             panel.plot(theta[~good], rate[~good], "x", color="#D55E00", markersize=3, alpha=0.6)
             panel.set_title(f"{DESIGN_NAMES[design]}: {_label(one)}", fontsize="medium")
         axes[1, column].set_xlabel(r"$\theta$ at the start [rad]")

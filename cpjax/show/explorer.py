@@ -1,13 +1,12 @@
 """A picture of one swing-up that follows its controller's numbers: what the sliders of a notebook move."""
 
-from typing import Any
-
 import jax
 import numpy as np
 from matplotlib.figure import Figure
 
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
+from cpjax.show.comparison import wrapped
 from cpjax.show.figures import DESIGN_COLOURS
 from cpjax.sim.rollout import Trajectory, rollout
 from cpjax.state import HANGING, State
@@ -49,12 +48,10 @@ class Explorer:
     def show(self, controller: Hybrid) -> Figure:
         """The picture of this controller."""
         run = jax.tree.map(np.asarray, self._run(controller))
-        theta: np.ndarray[Any, Any] = np.mod(run.state.theta + np.pi, 2.0 * np.pi) - np.pi
-        theta[1:][np.abs(np.diff(theta)) > np.pi] = np.nan  # a gap where it goes round
-        for line, values in zip(self._lines, (theta, run.state.x, run.voltage), strict=True):
+        for line, values in zip(self._lines, (wrapped(run.state), run.state.x, run.voltage), strict=True):
             line.set_data(run.time, values)
         found = run.metrics
-        if np.isfinite(found.settling_time):
+        if found.success:
             words = f"settles after {found.settling_time:.2f} s, travel {found.cart_travel:.2f} m, "
             self._title.set_text(words + f"effort {found.effort:.0f} V$^2$ s, {found.switches} changes of mode")
         else:

@@ -14,7 +14,8 @@ from cpjax.errors import InputError
 from cpjax.sim.metrics import Metrics
 from cpjax.state import NAMES, UNITS, State
 
-_MOST_CELLS = 1 << 14  # along one axis
+MOST_CELLS = 4096
+"""Along one axis."""
 _SIGMAS = 1.959963984540054  # of a normal distribution, that hold 95 %
 
 
@@ -36,8 +37,8 @@ class Axis:
                 raise InputError(f"Axis.{name}", value, "a finite number")
         if not self.low < self.high:
             raise InputError("Axis.high", self.high, f"above low, {self.low}")
-        if isinstance(self.cells, bool) or not isinstance(self.cells, int) or not 2 <= self.cells <= _MOST_CELLS:
-            raise InputError("Axis.cells", self.cells, f"a whole number from 2 to {_MOST_CELLS}")
+        if isinstance(self.cells, bool) or not isinstance(self.cells, int) or not 2 <= self.cells <= MOST_CELLS:
+            raise InputError("Axis.cells", self.cells, f"a whole number from 2 to {MOST_CELLS}")
 
     @property
     def unit(self) -> str:
