@@ -109,7 +109,7 @@ def known_controllers(plant: CartPole, plan: FrontPlan) -> list[tuple[str, Compa
 
     setting = Setting(count=plan.final, seed=seed_of(plan.seed, FINAL, 0), duration=plan.horizon, dt=plan.final_dt)
     chosen = [one for one in entries(plant) if one.gains != "computed"]
-    own = plant == paper.appendix_plant()
+    own = io.encode(plant) == io.encode(paper.appendix_plant())
     preset = "tuned, as shipped" if own else "as shipped for the appendix's plant"
     compared = compare(plant, chosen, setting)[1]
     return [(preset if one.entry.gains == "tuned" else one.entry.name, one) for one in compared]
