@@ -78,7 +78,7 @@ def run(given: argparse.Namespace) -> int:
     sections_of.designs(page, given)
     sections_of.forensics(page, given)
     if studies != "none":
-        sections_of.gradients(page, given)
+        sections_of.gradients(page, given, studies)
         sections_of.tuning(page, given, studies)
     sections_of.comparison(page, given, setting)
     if studies != "none":

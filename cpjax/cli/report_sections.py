@@ -42,6 +42,8 @@ QUICK_FRONTS: Mapping[str, Any] = {
 """Of a `FrontPlan`."""
 QUICK_TUNING: Mapping[str, Any] = {"candidates": 1023, "restarts": 4, "batch": 8, "steps": 36}
 """Of a `Plan`."""
+QUICK_AUDIT: Mapping[str, Any] = {"count": 4, "duration": 3.0, "dt": 0.002}
+"""Of `cpjax audit-gradients`."""
 
 
 def designs(page: Page, given: argparse.Namespace) -> None:
@@ -96,10 +98,10 @@ def forensics(page: Page, given: argparse.Namespace) -> None:
     page.table(forensics_text.DIRECTION_HEADER, known, text_columns=1)
 
 
-def gradients(page: Page, given: argparse.Namespace) -> None:
+def gradients(page: Page, given: argparse.Namespace, size: str) -> None:
     """Which gradients through the switch can be trusted."""
     plant = paper.appendix_plant()
-    audit = audited(given.out, plant, preset("lqr"), {}, given.seed)
+    audit = audited(given.out, plant, preset("lqr"), QUICK_AUDIT if size == "quick" else {}, given.seed)
 
     page.section("Can the gradients be trusted?")
     page.text(
@@ -127,7 +129,7 @@ def tuning(page: Page, given: argparse.Namespace, size: str) -> None:
         "controllers to begin with, the best of them tuned side by side, and the one that validates best kept."
     )
     rows = []
-    for design in DESIGNS:
+    for design in DESIGNS[1:] if size == "quick" else DESIGNS:
         plan = Plan(seed=given.seed, **(QUICK_TUNING if size == "quick" else {}))
         free = free_parameters(beginning("bland", design, plant))
         folder = given.out / f"tune-{design}"
@@ -151,7 +153,7 @@ def tuning(page: Page, given: argparse.Namespace, size: str) -> None:
         ["regulator", "success [%]", "settling [s]", "million steps of values", "of gradients", "time [s]"], rows, 1
     )
     page.note(
-        "Every number stands in `tune-lqr/tune.json` and `tune-placement/tune.json`, the controllers beside them in "
+        "Every number stands in the `tune.json` of each design's folder (`tune-lqr`), the controller beside it in "
         "`tuned.json`. Compared below are the tuned controllers that come with cpjax, from a longer search."
     )
 
@@ -230,7 +232,7 @@ def basins(page: Page, given: argparse.Namespace, cells: int) -> None:
 def fronts(page: Page, given: argparse.Namespace, size: str) -> None:
     """What settling faster costs."""
     plan = FrontPlan(seed=given.seed, **(QUICK_FRONTS if size == "quick" else {}))
-    found = pareto.made(given.out, paper.appendix_plant(), plan, pareto.SUPPLIES)
+    found = pareto.made(given.out, paper.appendix_plant(), plan, () if size == "quick" else pareto.SUPPLIES)
     page.section("At what price")
     page.text(
         "LQR or pole placement, and what does settling faster cost? Each point is a controller that settles from "
@@ -243,10 +245,10 @@ def fronts(page: Page, given: argparse.Namespace, size: str) -> None:
         "Down and left is better: what gradients reach (filled) and what random search reaches with as much work "
         "(crosses); stars are where the search began, hollow marks the paper's controllers and the shipped ones.",
     )
-    page.picture(
-        (given.out / "supplies.png").read_bytes(),
-        "Settling time against effort, one panel for each supply.",
-    )
+    if size == "full":
+        page.picture(
+            (given.out / "supplies.png").read_bytes(), "Settling time against effort, one panel for each supply."
+        )
     for sentence in front_text.findings(pareto.curves_of(found)):
         page.text(sentence)
     _, header, rows = pareto.table(found)

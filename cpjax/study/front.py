@@ -31,7 +31,7 @@ from cpjax.plant import CartPole
 from cpjax.sim.metrics import TimeOutside
 from cpjax.sim.rollout import measure
 from cpjax.state import State
-from cpjax.study.front_judge import BATCH, FINAL, JUDGE, SEMIFINAL, Judge, Judged, layers, together
+from cpjax.study.front_judge import BATCH, EXPLORE, FINAL, JUDGE, SEMIFINAL, Judge, Judged, layers, together
 from cpjax.study.front_plan import COSTS, FrontPlan, Lane
 from cpjax.study.front_yardstick import lanes
 from cpjax.tune import descent
@@ -200,6 +200,7 @@ class Tracer:
         prices = np.where(np.isfinite(bounds), plan.price, 0.0)  # of a bound's worth of each cost
         state = self._optimiser.init(vectors)
         met = dict(begun)
+        random = np.random.default_rng([plan.seed, EXPLORE])
         for step in range(plan.steps):
             aims = Aim(jnp.asarray(prices / bounds, vectors.dtype), jnp.asarray(supplies, vectors.dtype))
             slope, spent = self.gradient(vectors, aims, self._judge.starts(plan.batch, BATCH, step))
@@ -220,7 +221,9 @@ class Tracer:
                 if step + 1 >= plan.exchange_from * plan.steps:
                     better = [met[supply].fastest(cost, bound, plan.success) for supply, cost, bound in jobs]
                     jump = np.array([time < 0.98 * now for (_, time), now in zip(better, times, strict=True)])
-                    vectors = jnp.where(jump[:, None], np.stack([vector for vector, _ in better]), vectors)
+                    noise = plan.explore * (1.0 - (step + 1) / plan.steps) * random.standard_normal(vectors.shape)
+                    taken = np.stack([vector for vector, _ in better]) + noise
+                    vectors = jnp.where(jump[:, None], taken.astype(vectors.dtype), vectors)
                     state = jax.tree.map(functools.partial(_forgotten, rows=jump), state)
             report(step + 1, f"{len(jobs)} tunings side by side")
         return met

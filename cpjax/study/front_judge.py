@@ -25,7 +25,7 @@ from cpjax.tune.starting import beginning
 
 Numbers = np.ndarray[Any, Any]
 
-SCREEN, BATCH, JUDGE, SEMIFINAL, FINAL, CANDIDATES = range(6)
+SCREEN, BATCH, JUDGE, SEMIFINAL, FINAL, CANDIDATES, EXPLORE = range(7)
 """What random numbers are for."""
 
 _RUNS, _CONTROLLERS = 2048, 64  # simulated, and designed, at a time

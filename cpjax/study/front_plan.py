@@ -30,6 +30,7 @@ class FrontPlan:
       screening: starts by which they are judged.
       steps: of the optimiser.
       batch: starts of a step.
+      explore: noise on the unconstrained parameters of a tuning that goes on from another's, less and less to the end.
       learning_rate: Adam's.
       clip: a start's gradient is shortened to this many times the batch's median norm.
       duration: of the tunings' rollouts [s].
@@ -65,9 +66,10 @@ class FrontPlan:
     dt: float = 0.02
     spare_rate: float = 20.0
     width: float = 0.05
-    variety: int = 6
+    variety: int = 16
     judge_every: int = 10
     exchange_from: float = 0.4
+    explore: float = 0.15
     judging: int = 96
     semifinal: int = 256
     final: int = 1024
@@ -83,6 +85,8 @@ class FrontPlan:
                 least = 0 if field.name in ("seed", "steps") else 1
                 if isinstance(value, bool) or not isinstance(value, int) or value < least:
                     raise InputError(field.name, value, f"a whole number, at least {least}")
+            elif field.name == "explore" and value == 0.0:
+                continue
             elif isinstance(value, (bool, str)) or not 0.0 < value < math.inf:
                 raise InputError(field.name, value, "a finite number above 0")
         for name, largest in (("lowest", 0.999), ("success", 1.0), ("exchange_from", 1.0)):
