@@ -23,7 +23,7 @@ from cpjax import cli, io
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 WIDTHS = {"phone": 390, "desktop": 1280}
-HEIGHT = 16000  # what is left over below is cut off
+HEIGHT = 24000  # what is left over below is cut off
 OPTIONS = (
     "--headless",
     "--no-sandbox",

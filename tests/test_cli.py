@@ -870,8 +870,8 @@ def test_the_studies_in_a_report_are_those_of_its_json(command, tmp_path, monkey
     assert sources.count("data:image/gif;") == 1
     audit = document(tmp_path, "audit_gradients.json")
     assert [cells[0] for cells in page.rows if cells[0] in audit["names"]] == audit["names"]
-    found = document(tmp_path / "tune-lqr", "tune.json")
-    expected = ["LQR", f"{100 * found['success_rate']:.2f}", f"{found['settling_time']:.3f}"]
+    found = document(tmp_path / "tune-placement", "tune.json")
+    expected = ["pole placement", f"{100 * found['success_rate']:.2f}", f"{found['settling_time']:.3f}"]
     assert expected in [cells[:3] for cells in page.rows]
     basins = document(tmp_path, "basin.json")["basins"]
     shown = [cells for cells in page.rows if cells and cells[0] in CONTROLLERS]

@@ -17,8 +17,8 @@ body { margin: 0 auto; max-width: 68rem; padding: 1.5rem 1rem 4rem; background: 
   font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
 h1 { line-height: 1.2; font-size: 1.9rem; margin: 0.5rem 0; } h2 { margin-top: 2.6rem; font-size: 1.35rem; }
 p.lead { font-size: 1.1rem; color: var(--soft); } figure { margin: 1.5rem 0; }
-figure img { display: block; width: 100%; height: auto; background: #fff; border: 1px solid var(--line);
-  border-radius: 6px; }
+figure img { display: block; width: 100%; height: auto; background: #fff; }
+@media screen and (max-width: 44rem) { figure img { width: 44rem; } }
 figcaption, .note { color: var(--soft); font-size: 0.93rem; margin-top: 0.4rem; }
 .scroll { overflow-x: auto; border: 1px solid var(--line); border-radius: 6px; }
 table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
@@ -66,7 +66,9 @@ class Page:
         data = base64.b64encode(content).decode("ascii")
         alt = html.escape(caption, quote=True)
         image = f'<img alt="{alt}" src="data:image/{kind};base64,{data}">'
-        self._body.append(f"<figure>{image}<figcaption>{_inline(caption)}</figcaption></figure>")
+        self._body.append(
+            f'<figure><div class="scroll">{image}</div><figcaption>{_inline(caption)}</figcaption></figure>'
+        )
 
     def write(self, path: Path) -> None:
         """Writes the page atomically."""

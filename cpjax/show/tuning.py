@@ -3,13 +3,19 @@
 import numpy as np
 from matplotlib.figure import Figure
 
+from cpjax.controllers import PoleFactors
+from cpjax.show.figures import DESIGN_COLOURS
 from cpjax.tune.outcome import Tuning
 
-_BEST, _OTHERS = "#0072B2", "#999999"
+_OTHERS = "#999999"
 
 
 def picture(tuning: Tuning) -> Figure:
-    """Settling time and success rate of every restart over the steps; the best one of each validation in colour."""
+    """Settling time and success rate of every restart over the steps; the best one of each validation in the colour of
+    its design.
+    """
+    placed = isinstance(getattr(tuning.controller.regulator, "design", None), PoleFactors)
+    colour = DESIGN_COLOURS["placement" if placed else "lqr"]
     steps = np.array([record["step"] for record in tuning.history])
     times = np.array([record["settling_times"] for record in tuning.history])
     rates = 100.0 * np.array([record["success_rates"] for record in tuning.history])
@@ -20,7 +26,7 @@ def picture(tuning: Tuning) -> Figure:
     above, below = figure.subplots(2, 1, sharex=True)
     for axes, values in ((above, times), (below, rates)):
         axes.plot(steps, values, ".", color=_OTHERS, markersize=5)
-        axes.plot(steps, values[rows, best], "o-", color=_BEST, markersize=5, label="best of this validation by score")
+        axes.plot(steps, values[rows, best], "o-", color=colour, markersize=5, label="best of this validation by score")
         axes.grid(alpha=0.3)
     above.set_ylabel("mean settling time [s]")
     below.set_ylabel("successful starts [%]")
