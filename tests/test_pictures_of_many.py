@@ -46,7 +46,7 @@ def test_an_animation_as_a_page_holds_the_runs_and_asks_for_nothing(command, tmp
     assert "http" not in page
     assert "url(" not in page
     data = json.loads(page.split("const data = ")[1].split(";\n")[0])
-    assert [scene["title"] for scene in data["scenes"]] == ["corrected/lqr", "tuned_lqr"]
+    assert [scene["title"] for scene in data["scenes"]] == ["paper, corrected, LQR", "tuned, LQR"]
     plant = cpjax.paper.appendix_plant()
     run = cpjax.rollout(plant, cpjax.preset("lqr"), cpjax.HANGING, duration=0.5, dt=0.002, clock="sampled")
     np.testing.assert_allclose(data["scenes"][1]["theta"], np.asarray(run.state.theta)[::25], atol=1e-4)

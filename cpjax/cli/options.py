@@ -272,6 +272,15 @@ def named_hybrid(name: str, plant: CartPole) -> Hybrid:
     return controller
 
 
+def controller_title(name: str) -> str:
+    """What `named_hybrid` takes, in words for people."""
+    law, *others = name.split("/")
+    if law in paper.LAWS and others:
+        words = {"lqr": "LQR", "placement": "pole placement"}
+        return ", ".join([f"paper, {law.replace('-', ' ')}", *(words.get(one, f"{one} gains") for one in others)])
+    return {"tuned_lqr": "tuned, LQR", "tuned_place": "tuned, pole placement"}.get(name, name)
+
+
 def build_hybrid(given: Mapping[str, Any], plant: CartPole) -> Hybrid:
     """As `build_controller`, for commands that need a regulator behind a gate."""
     controller = build_controller(given, plant)

@@ -6,10 +6,10 @@ from typing import Any, get_args
 
 from cpjax import io, paper
 from cpjax.cli import basin, pareto
-from cpjax.cli.animate import animated
+from cpjax.cli.animate import animated, verdict
 from cpjax.cli.audit_gradients import audited
 from cpjax.cli.compare import compared
-from cpjax.cli.options import named_hybrid
+from cpjax.cli.options import controller_title, named_hybrid
 from cpjax.cli.progress import progress
 from cpjax.cli.tune import tuned
 from cpjax.controllers import AngleGate
@@ -137,7 +137,7 @@ def tuning(page: Page, given: argparse.Namespace, size: str) -> None:
         page.picture(
             (folder / "tune.png").read_bytes(),
             f"{DESIGN_NAMES[design]}: settling time and share of starts of each restart (grey), and of the one that is "
-            "best by then, over the steps of the optimiser.",
+            "best by then, over the steps of the optimiser. Success counts before time.",
         )
         rows.append(
             [
@@ -190,20 +190,14 @@ def comparison(page: Page, given: argparse.Namespace, setting: Setting) -> None:
 def animation(page: Page, given: argparse.Namespace) -> None:
     """The paper's controller and the tuned one, moving."""
     plant = paper.appendix_plant()
-    names = {"corrected/lqr": "paper, corrected, LQR", "tuned_lqr": "tuned, LQR"}
-    controllers = {words: named_hybrid(name, plant) for name, words in names.items()}
+    controllers = {name: named_hybrid(name, plant) for name in ("corrected/lqr", "tuned_lqr")}
     path, runs = animated(
         given.out, plant, controllers, HANGING, {"format": "gif", "duration": 6.0, "rate": 20.0}, seed=given.seed
     )
     page.picture(
         path.read_bytes(),
         "Six seconds from rest, in real time: "
-        + "; ".join(
-            f"{name} stands after {float(run.metrics.settling_time):.2f} s"
-            if bool(run.metrics.success)
-            else f"{name} does not stand by then"
-            for name, run in runs.items()
-        )
+        + "; ".join(f"{controller_title(name)}, {verdict(run, 6.0)}" for name, run in runs.items())
         + ".",
         kind="gif",
     )
@@ -234,6 +228,11 @@ def fronts(page: Page, given: argparse.Namespace, size: str) -> None:
     plan = FrontPlan(seed=given.seed, **(QUICK_FRONTS if size == "quick" else {}))
     found = pareto.made(given.out, paper.appendix_plant(), plan, () if size == "quick" else pareto.SUPPLIES)
     page.section("At what price")
+    if size == "quick":
+        page.text(
+            f"A quick version, far from converged: {plan.bounds + 1} tunings for each cost, {plan.steps} steps, points "
+            f"measured from {plan.final} starts. `cpjax pareto`, or `make report-full`, does it in full."
+        )
     page.text(
         "LQR or pole placement, and what does settling faster cost? Each point is a controller that settles from "
         f"{100 * plan.success:g} % of unseen starts at least, and that no other found beats in both. Traced by "

@@ -117,11 +117,13 @@ def _sampled(run: Trajectory, duration: float, rate: float) -> tuple[np.ndarray[
 def _half_width(scenes: Sequence[Scene], duration: float) -> float:
     """Of the view, the same for all [m]: a cart that runs away leaves it."""
     reach = [
-        float(np.max(np.abs(np.asarray(scene.trajectory.state.x)[np.asarray(scene.trajectory.time) <= duration])))
+        float(np.max(np.maximum(np.abs(x), np.abs(x + scene.length * np.sin(theta)))))
         for scene in scenes
+        for shown in [np.asarray(scene.trajectory.time) <= duration]
+        for x, theta in [(np.asarray(scene.trajectory.state.x)[shown], np.asarray(scene.trajectory.state.theta)[shown])]
     ]
     longest = max(scene.length for scene in scenes)
-    return float(np.clip(max(reach) + 0.4 * longest, 1.3 * longest, 3.0 * longest))
+    return float(np.clip(max(reach) + 0.25 * longest, 1.3 * longest, 4.0 * longest))
 
 
 class _Stage:
@@ -165,7 +167,7 @@ class _Stage:
         limit = scene.voltage_limit if np.isfinite(scene.voltage_limit) else max(1.0, abs(voltage))
         self._bar.set_width(0.8 * self._half * voltage / limit)
         away = "" if abs(x) <= self._half else f"   x = {x:+.1f} m"
-        self._text.set_text(f"{'catch' if mode == REGULATE else 'swing up'}   {voltage:+5.1f} V{away}")
+        self._text.set_text(f"{'regulator' if mode == REGULATE else 'swing up'}   {voltage:+5.1f} V{away}")
 
 
 def _pictures(scenes: Sequence[Scene], duration: float, rate: float, report: Report | None) -> Iterator[Image.Image]:
@@ -305,7 +307,7 @@ function draw(i) {
     c.fillRect(X(0), Y(-1.43 * L), 0.8 * data.half * scale * u / limit, 0.12 * L * scale);
     c.fillStyle = ink; c.textAlign = "center"; c.font = "14px system-ui, sans-serif";
     const away = Math.abs(x) > data.half ? "   x = " + x.toFixed(1) + " m" : "";
-    c.fillText((scene.mode[i] ? "catch" : "swing up") + "   " + u.toFixed(1) + " V" + away, X(0), Y(-1.33 * L));
+    c.fillText((scene.mode[i] ? "regulator" : "swing up") + "   " + u.toFixed(1) + " V" + away, X(0), Y(-1.33 * L));
   }
   document.getElementById("time").textContent = (i / data.rate).toFixed(1) + " s";
 }

@@ -24,7 +24,7 @@ LABELS = {
     "theta_dot": r"$\dot\theta$ [rad/s]",
 }
 _FAILED = "#c9c9c9"
-_GATE, _SATURATION, _CERTIFIED = "#D55E00", "#111111", "#CC79A7"
+_GATE, _SATURATION, _CERTIFIED = "#E69F00", "#111111", "#CC79A7"
 _MOST_SWITCHES = 6
 _FINE = 400  # points along an axis, for lines
 
@@ -52,7 +52,7 @@ def basins(chart: Map, panels: Sequence[Panel]) -> Figure:
     longest = max((_longest(panel.metrics) for panel in panels), default=1.0)
     times = Normalize(0.0, longest)
     counts = BoundaryNorm(np.arange(-0.5, _MOST_SWITCHES + 1), _MOST_SWITCHES + 1)
-    few = ListedColormap(["#440154", "#3b528b", "#21918c", "#5ec962", "#fde725", "#f0f0c0", "#ffffff"])
+    few = ListedColormap(["#440154", "#3b528b", "#21918c", "#5ec962", "#fde725", "#f0a0c8", "#a0305a"])
     drawn: list[Any] = [None, None]
     for column, panel in enumerate(panels):
         good = np.asarray(panel.metrics.success).reshape(chart.shape)
@@ -81,9 +81,9 @@ def basins(chart: Map, panels: Sequence[Panel]) -> Figure:
     names = ("gate", "regulator asks for the whole supply", "certified for the linear model")
     handles = [Line2D([], [], color=_GATE), Line2D([], [], color=_SATURATION, linestyle="--")]
     handles.append(Line2D([], [], color=_CERTIFIED))
-    figure.legend(handles, names, loc="outside lower center", ncols=3, frameon=False)
+    figure.legend(handles, names, loc="outside lower center", ncols=3 if len(panels) > 1 else 1, frameon=False)
     others = ", ".join(f"{_range(chart, name)}" for name in chart.middle)
-    figure.suptitle(f"Sampled, not certified: one run from each of {good.size:,} cells; {others}")
+    figure.suptitle(f"Sampled, not certified: one run\u00a0from each of {good.size:,} cells; {others}", wrap=True)
     return figure
 
 

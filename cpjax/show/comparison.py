@@ -69,7 +69,7 @@ def findings(results: Sequence[Compared]) -> list[str]:
 
 def _answer(results: Sequence[Compared], *, tuned: bool) -> str:
     a, b = (best(results, design, tuned=tuned) for design in DESIGNS)
-    kind = "Tuned" if tuned else "With the paper's gains and laws, the better of each"
+    kind = "Tuned" if tuned else "Of the paper's laws and gains, as printed or computed anew, the better of each"
     caught_by_a, caught_by_b = (np.asarray(one.metrics.success) for one in (a, b))
     p = mcnemar_p_value(int(np.sum(caught_by_a & ~caught_by_b)), int(np.sum(caught_by_b & ~caught_by_a)))
     verdict = "a difference" if p < 1e-3 else "no difference at 99.9 %"
@@ -194,7 +194,9 @@ def by_start(starts: State, results: Sequence[Compared]) -> Figure:
     shown = [best(results, design, tuned=tuned).metrics for design in DESIGNS for tuned in (False, True)]
     times = np.concatenate([np.asarray(one.settling_time)[np.asarray(one.success)] for one in shown])
     low, high = (float(np.min(times)), float(np.max(times))) if times.size else (1.0, 10.0)
-    norm = LogNorm(max(low, 0.1), max(high, 1.01 * max(low, 0.1)))  # who begins settled has no logarithm
+    low = max(low, 0.1)  # who begins settled has no logarithm
+    high = max(high, 1.01 * low)
+    norm = LogNorm(low, high)
     drawn: Any = None
     for column, design in enumerate(DESIGNS):
         for row, tuned in enumerate((False, True)):
@@ -202,10 +204,13 @@ def by_start(starts: State, results: Sequence[Compared]) -> Figure:
             good = np.asarray(one.metrics.success)
             time = np.asarray(one.metrics.settling_time)
             drawn = panel.scatter(theta[good], rate[good], c=time[good], s=5, cmap="viridis", norm=norm)
-            panel.plot(theta[~good], rate[~good], "x", color="#D55E00", markersize=3, alpha=0.6)
+            panel.plot(theta[~good], rate[~good], "x", color="0.55", markersize=3, alpha=0.6)
             panel.set_title(f"{DESIGN_NAMES[design]}: {_label(one)}", fontsize="medium")
         axes[1, column].set_xlabel(r"$\theta$ at the start [rad]")
     for row in range(2):
         axes[row, 0].set_ylabel(r"$\dot\theta$ at the start [rad/s]")
-    figure.colorbar(drawn, ax=axes, label="settling time [s] (x: fails)")
+    ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 3, 5, 10, 20, 50, 100) if low <= tick <= high]
+    bar = figure.colorbar(drawn, ax=axes, label="settling time [s] (x: fails)", ticks=ticks)
+    bar.ax.set_yticklabels([f"{tick:g}" for tick in ticks])
+    bar.minorticks_off()
     return figure

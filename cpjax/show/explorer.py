@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
 from cpjax.show.comparison import wrapped
-from cpjax.show.figures import DESIGN_COLOURS
+from cpjax.show.figures import design_colour
 from cpjax.sim.rollout import Trajectory, rollout
 from cpjax.state import HANGING, State
 
@@ -36,7 +36,7 @@ class Explorer:
         ranges = ((-np.pi, np.pi), (-2.0, 2.0), (-1.1 * limit, 1.1 * limit) if np.isfinite(limit) else (-30.0, 30.0))
         self._lines = []
         for panel, label, ends in zip(axes, labels, ranges, strict=True):
-            (line,) = panel.plot([], [], color=DESIGN_COLOURS["placement"], linewidth=1.3)
+            (line,) = panel.plot([], [], linewidth=1.3)
             self._lines.append(line)
             panel.set_ylabel(label)
             panel.set_ylim(*ends)
@@ -50,6 +50,7 @@ class Explorer:
         run = jax.tree.map(np.asarray, self._run(controller))
         for line, values in zip(self._lines, (wrapped(run.state), run.state.x, run.voltage), strict=True):
             line.set_data(run.time, values)
+            line.set_color(design_colour(controller))
         found = run.metrics
         if found.success:
             words = f"settles after {found.settling_time:.2f} s, travel {found.cart_travel:.2f} m, "

@@ -14,12 +14,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cpjax import io
-from cpjax.controllers import REGULATE
+from cpjax.controllers import REGULATE, Hybrid, PoleFactors
 from cpjax.sim.rollout import Trajectory
 
 DESIGN_COLOURS: Mapping[str, str] = {"lqr": "#D55E00", "placement": "#0072B2"}
 DESIGN_NAMES: Mapping[str, str] = {"lqr": "LQR", "placement": "pole placement"}
-_X, _THETA, _VOLTAGE, _CATCH = "#009E73", "#CC79A7", "#0072B2", "#999999"
+_X, _THETA, _VOLTAGE, _CATCH = "#009E73", "#CC79A7", "#333333", "#999999"
+
+
+def design_colour(controller: Hybrid) -> str:
+    """Of a controller whose regulator knows its design; LQR's where it does not."""
+    placed = isinstance(getattr(controller.regulator, "design", None), PoleFactors)
+    return DESIGN_COLOURS["placement" if placed else "lqr"]
 
 
 def png(figure: Figure) -> bytes:

@@ -26,7 +26,7 @@ def fit_cells(fit: Fit, plant: CartPole) -> list[str]:
     with_it = changed(plant, dict(zip(fit.parameters, fit.values, strict=True)))
     return [
         ", ".join(fit.parameters),
-        ", ".join(f"{v:.5g} {units[n]}" for n, v in zip(fit.parameters, fit.values, strict=True)),
+        ", ".join(f"{v:.5g} {units[n]}".removesuffix(" 1") for n, v in zip(fit.parameters, fit.values, strict=True)),
         f"{fit.worst:.3g}",
         f"{float(with_it.motor.force_per_voltage):.5f}",
         f"{float(with_it.motor.damping + with_it.cart_friction):.5f}",

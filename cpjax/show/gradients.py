@@ -6,6 +6,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from cpjax.study.gradient_audit import GradientAudit
 
@@ -88,6 +89,7 @@ def picture(audits: Sequence[GradientAudit]) -> Figure:
     by_speed.set_xlabel("slowest crossing of the gate [1/s]")
     by_speed.set_title("worst derivative of each run", loc="left")
     by_speed.sharey(by_horizon)
+    by_speed.xaxis.set_minor_formatter(NullFormatter())
     growths = np.concatenate([a.growth for a in audits])
     growth.semilogy(audits[0].horizons, growths.T, color="#009E73", alpha=min(1.0, 8.0 / len(growths)))
     growth.semilogy(audits[0].horizons, np.nanmedian(growths, axis=0), "o-", color="#000000", label="median")

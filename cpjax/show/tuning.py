@@ -3,8 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpjax.controllers import PoleFactors
-from cpjax.show.figures import DESIGN_COLOURS
+from cpjax.show.figures import design_colour
 from cpjax.tune.outcome import Tuning
 
 _OTHERS = "#999999"
@@ -14,8 +13,7 @@ def picture(tuning: Tuning) -> Figure:
     """Settling time and success rate of every restart over the steps; the best one of each validation in the colour of
     its design.
     """
-    placed = isinstance(getattr(tuning.controller.regulator, "design", None), PoleFactors)
-    colour = DESIGN_COLOURS["placement" if placed else "lqr"]
+    colour = design_colour(tuning.controller)
     steps = np.array([record["step"] for record in tuning.history])
     times = np.array([record["settling_times"] for record in tuning.history])
     rates = 100.0 * np.array([record["success_rates"] for record in tuning.history])
