@@ -61,7 +61,7 @@ def run(given: argparse.Namespace) -> int:
     )
     page.text(
         "`hanging` starts lie within 0.3 rad, 0.3 rad/s and 0.1 m of hanging at rest in the middle. The `appendix` "
-        "plant has the paper's printed parameters; the `identified` one those from which its printed gains follow. The law "
+        "plant has the paper's printed parameters; the `identified` one those from which its printed gains follow. Law "
         "`as-printed` has the paper's signs, `corrected` those that its derivation gives, with its gain k = 0.2, "
         "`corrected-as-voltage` takes the wanted acceleration for a voltage, and `corrected-centred` has k = 5 and "
         "holds the cart near the middle."
