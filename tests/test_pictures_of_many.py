@@ -91,6 +91,20 @@ def test_a_film_is_what_the_encoder_makes_of_the_pictures_or_what_it_says(
         assert film.stat().st_size % 9 == 0
 
 
+def test_the_pole_is_drawn_where_the_plants_coordinates_have_its_bob():
+    from matplotlib.figure import Figure
+
+    plant = cpjax.paper.appendix_plant()
+    run = cpjax.rollout(plant, cpjax.preset("lqr"), cpjax.HANGING, duration=0.1, dt=0.002, clock="sampled")
+    axes = Figure().subplots()
+    stage = animation._Stage(axes, animation.Scene("", "black", run, 0.7, 12.0), 2.0)
+    stage.draw(0.3, 0.5, 0.0, 0, 5)
+    assert stage._bob.get_data()[0][0] == pytest.approx(
+        0.3 - 0.7 * np.sin(0.5)
+    )  # x - l sin(theta), as cpjax.State says
+    assert animation._PAGE.count("- L * Math.sin(") == 2
+
+
 def test_without_an_encoder_a_film_becomes_a_page(command, tmp_path, monkeypatch):
     monkeypatch.setattr(animation, "encoder", lambda: None)
     done = command("animate", "--format", "mp4", "--duration", 0.1, "--out", tmp_path)

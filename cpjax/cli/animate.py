@@ -114,6 +114,7 @@ def animated(
         "plant": io.encode(plant),
         "file": path.name,
         "duration": duration,
+        "metrics_over": duration + _AFTER,
         "rate": chosen["rate"],
         "runs": {
             name: {

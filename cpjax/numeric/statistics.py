@@ -50,7 +50,9 @@ def mcnemar_p_value(only_a: int, only_b: int) -> float:
     Raises:
       InputError: a count below 0.
     """
-    _check_counts(only_a, only_a + only_b or 1)
+    for name, count in (("only_a", only_a), ("only_b", only_b)):
+        if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= _MOST:
+            raise InputError(name, count, f"a whole number from 0 to {_MOST}")
     total, fewer = only_a + only_b, min(only_a, only_b)
     # P(at most `fewer` heads in `total` fair tosses), its terms by logarithms: they may be far below 1e-308.
     logs = [math.lgamma(total + 1) - math.lgamma(k + 1) - math.lgamma(total - k + 1) for k in range(fewer + 1)]

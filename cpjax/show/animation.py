@@ -117,7 +117,7 @@ def _sampled(run: Trajectory, duration: float, rate: float) -> tuple[np.ndarray[
 def _half_width(scenes: Sequence[Scene], duration: float) -> float:
     """Of the view, the same for all [m]: a cart that runs away leaves it."""
     reach = [
-        float(np.max(np.maximum(np.abs(x), np.abs(x + scene.length * np.sin(theta)))))
+        float(np.max(np.maximum(np.abs(x), np.abs(x - scene.length * np.sin(theta)))))
         for scene in scenes
         for shown in [np.asarray(scene.trajectory.time) <= duration]
         for x, theta in [(np.asarray(scene.trajectory.state.x)[shown], np.asarray(scene.trajectory.state.theta)[shown])]
@@ -156,7 +156,7 @@ class _Stage:
     def draw(self, x: float, theta: float, voltage: float, mode: int, kept: int) -> None:
         """At one instant; `kept` is how many points of the trail stay."""
         scene = self._scene
-        tip = x + scene.length * np.sin(theta), scene.length * np.cos(theta)
+        tip = x - scene.length * np.sin(theta), scene.length * np.cos(theta)
         self._cart.set_xy((x - 0.5 * self._cart_size[0], -0.5 * self._cart_size[1]))
         self._pole.set_data([x, tip[0]], [0.0, tip[1]])
         self._bob.set_data([tip[0]], [tip[1]])
@@ -291,12 +291,12 @@ function draw(i) {
     c.beginPath(); c.moveTo(0, Y(-0.08 * L)); c.lineTo(width, Y(-0.08 * L)); c.stroke();
     c.strokeStyle = scene.colour; c.globalAlpha = 0.35; c.lineWidth = 2; c.beginPath();
     for (let k = Math.max(0, i - Math.round(0.6 * data.rate)); k <= i; k++)
-      c.lineTo(X(scene.x[k] + L * Math.sin(scene.theta[k])), Y(L * Math.cos(scene.theta[k])));
+      c.lineTo(X(scene.x[k] - L * Math.sin(scene.theta[k])), Y(L * Math.cos(scene.theta[k])));
     c.stroke(); c.globalAlpha = 1;
     c.fillStyle = cart; c.strokeStyle = ink;
     c.fillRect(X(x - 0.18 * L), Y(0.08 * L), 0.36 * L * scale, 0.16 * L * scale);
     c.strokeRect(X(x - 0.18 * L), Y(0.08 * L), 0.36 * L * scale, 0.16 * L * scale);
-    const tip = [X(x + L * Math.sin(theta)), Y(L * Math.cos(theta))];
+    const tip = [X(x - L * Math.sin(theta)), Y(L * Math.cos(theta))];
     c.strokeStyle = c.fillStyle = scene.colour; c.lineWidth = 5; c.lineCap = "round";
     c.beginPath(); c.moveTo(X(x), Y(0)); c.lineTo(...tip); c.stroke();
     c.beginPath(); c.arc(...tip, 6, 0, 7); c.fill();

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest, chi2_contingency
 
+from cpjax.errors import InputError
 from cpjax.numeric.statistics import mcnemar_p_value, two_proportion_p_value, wilson_interval
 
 COUNTS = [(0, 1), (1, 1), (0, 8), (8, 8), (1, 8), (3, 8), (50, 100), (99, 100), (2048, 4096), (4095, 4096), (1, 10**6)]
@@ -79,6 +80,12 @@ def test_opposite_rates_over_many_trials_have_a_vanishing_p_value_without_a_warn
     p = two_proportion_p_value(0, 10**9, 10**9, 10**9)
     assert 0.0 <= p < 1e-300
     assert math.isfinite(p)
+
+
+@pytest.mark.parametrize(("counts", "field"), [((1, -1), "only_b"), ((-1, 2), "only_a"), ((1, True), "only_b")])
+def test_mcnemars_test_names_a_bad_count(counts, field):
+    with pytest.raises(InputError, match=field):
+        mcnemar_p_value(*counts)
 
 
 @pytest.mark.parametrize(("a", "b"), [(0, 0), (0, 1), (3, 9), (9, 3), (50, 50), (400, 520), (0, 2000)])
