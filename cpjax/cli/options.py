@@ -276,8 +276,10 @@ def controller_title(name: str) -> str:
     """What `named_hybrid` takes, in words for people."""
     law, *others = name.split("/")
     if law in paper.LAWS and others:
-        words = {"lqr": "LQR", "placement": "pole placement"}
-        return ", ".join([f"paper, {law.replace('-', ' ')}", *(words.get(one, f"{one} gains") for one in others)])
+        from cpjax.show.figures import DESIGN_NAMES  # matplotlib takes a while; parsing options should not wait for it
+
+        rest = (DESIGN_NAMES.get(one, f"{one} gains") for one in others)
+        return ", ".join([f"paper, {law.replace('-', ' ')}", *rest])
     return {"tuned_lqr": "tuned, LQR", "tuned_place": "tuned, pole placement"}.get(name, name)
 
 

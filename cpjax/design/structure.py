@@ -194,9 +194,10 @@ def _gramian(A: jax.Array, Q: jax.Array, horizon: Scalar | None) -> jax.Array:
 def _gramian_until(A: jax.Array, Q: jax.Array, horizon: jax.Array) -> jax.Array:
     n = A.shape[0]
     norm = jnp.max(jnp.sum(jnp.abs(A), axis=0))
+    # A number of doublings: a step function of A and the horizon, whose slope is 0 or nothing.
     doublings = lax.stop_gradient(jnp.clip(jnp.ceil(jnp.log2(norm * horizon)), 0.0, _MOST_DOUBLINGS))
     short = horizon * jnp.exp2(-doublings)
-    # W is linear in Q; in this unit neither Q nor A makes the block large.
+    # W is linear in Q; in this unit neither Q nor A makes the block large. It cancels, so it needs no derivative.
     unit = lax.stop_gradient(jnp.max(jnp.abs(Q)) * short)
     unit = jnp.where(unit > 0.0, unit, 1.0)
     block = jnp.block([[-A, Q / unit], [jnp.zeros_like(A), A.T]])

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 
 from cpjax.controllers import Hybrid
 from cpjax.controllers.protocol import SWING_UP
+from cpjax.show.figures import GATE_COLOUR
 from cpjax.sim.metrics import Metrics
 from cpjax.state import NAMES, State
 from cpjax.study.basin import Area, Map
@@ -24,7 +25,7 @@ LABELS = {
     "theta_dot": r"$\dot\theta$ [rad/s]",
 }
 _FAILED = "#c9c9c9"
-_GATE, _SATURATION, _CERTIFIED = "#E69F00", "#111111", "#CC79A7"
+_SATURATION, _CERTIFIED = "#111111", "#CC79A7"
 _MOST_SWITCHES = 6
 _FINE = 400  # points along an axis, for lines
 
@@ -79,7 +80,7 @@ def basins(chart: Map, panels: Sequence[Panel]) -> Figure:
     bar = figure.colorbar(drawn[1], ax=axes[1], label="changes of mode", ticks=range(_MOST_SWITCHES + 1))
     bar.ax.set_yticklabels([*map(str, range(_MOST_SWITCHES)), f"{_MOST_SWITCHES}+"])
     names = ("gate", "regulator asks for the whole supply", "certified for the linear model")
-    handles = [Line2D([], [], color=_GATE), Line2D([], [], color=_SATURATION, linestyle="--")]
+    handles = [Line2D([], [], color=GATE_COLOUR), Line2D([], [], color=_SATURATION, linestyle="--")]
     handles.append(Line2D([], [], color=_CERTIFIED))
     figure.legend(handles, names, loc="outside lower center", ncols=3 if len(panels) > 1 else 1, frameon=False)
     others = ", ".join(f"{_range(chart, name)}" for name in chart.middle)
@@ -105,7 +106,7 @@ def _lines(axes: Axes, chart: Map, panel: Panel) -> None:
     columns = {name: np.asarray(grid.get(name, np.full((_FINE, _FINE), chart.middle.get(name)))) for name in NAMES}
     state = State(**columns)
     margin = np.asarray(panel.controller.gate.margin(state, jnp.int32(SWING_UP)))
-    fields = [(margin, 0.0, _GATE, "-")]
+    fields = [(margin, 0.0, GATE_COLOUR, "-")]
     if panel.check is not None:
         reference = getattr(panel.controller.regulator, "reference", None)
         s = np.stack([columns[n] - (0.0 if reference is None else float(getattr(reference, n))) for n in NAMES])

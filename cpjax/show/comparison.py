@@ -16,13 +16,12 @@ from cpjax.controllers import REGULATE, SWING_UP, Hybrid
 from cpjax.numeric.statistics import mcnemar_p_value
 from cpjax.numeric.trigonometry import wrap_angle
 from cpjax.plant import CartPole
-from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES
+from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES, GATE_COLOUR
 from cpjax.sim.rollout import Trajectory
 from cpjax.state import State
 from cpjax.study.comparison import Compared, best
 from cpjax.study.reproduction import DESIGNS
 
-_GATE = "#E69F00"
 HEADER = (
     "controller",
     "regulator",
@@ -152,7 +151,7 @@ def phase_portraits(plant: CartPole, shown: Shown, title: str) -> Figure:
         "start": Line2D([], [], color="black", marker="o", linestyle="none", markersize=5),
         "energy of upright": Line2D([], [], color="black", linewidth=1.3, linestyle="--"),
         "other energies, a fifth of the lift apart": Line2D([], [], color="0.75", linewidth=0.8),
-        "gate": Patch(facecolor=_GATE, alpha=0.25),
+        "gate": Patch(facecolor=GATE_COLOUR, alpha=0.25),
     }
     figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=6, frameon=False)
     return figure
@@ -176,7 +175,7 @@ def _energy_and_gate(axes: Axes, plant: CartPole, controller: Hybrid, high: floa
     axes.contour(theta, rate, energy, levels=[0.0], colors="black", linewidths=1.3, linestyles="--")
     margin = np.asarray(controller.gate.margin(state, jnp.int32(SWING_UP)))
     if margin.max() > 0.0:
-        axes.contourf(theta, rate, margin, levels=[0.0, float(margin.max())], colors=[_GATE], alpha=0.25)
+        axes.contourf(theta, rate, margin, levels=[0.0, float(margin.max())], colors=[GATE_COLOUR], alpha=0.25)
 
 
 def wrapped(state: State) -> np.ndarray[Any, Any]:
@@ -191,16 +190,17 @@ def by_start(starts: State, results: Sequence[Compared]) -> Figure:
     figure = Figure(figsize=(12, 6.5), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     theta, rate = np.asarray(starts.theta), np.asarray(starts.theta_dot)
-    shown = [best(results, design, tuned=tuned).metrics for design in DESIGNS for tuned in (False, True)]
-    times = np.concatenate([np.asarray(one.settling_time)[np.asarray(one.success)] for one in shown])
+    shown = [[best(results, design, tuned=tuned) for design in DESIGNS] for tuned in (False, True)]
+    metrics = [one.metrics for row in shown for one in row]
+    times = np.concatenate([np.asarray(one.settling_time)[np.asarray(one.success)] for one in metrics])
     low, high = (float(np.min(times)), float(np.max(times))) if times.size else (1.0, 10.0)
     low = max(low, 0.1)  # who begins settled has no logarithm
     high = max(high, 1.01 * low)
     norm = LogNorm(low, high)
     drawn: Any = None
     for column, design in enumerate(DESIGNS):
-        for row, tuned in enumerate((False, True)):
-            one, panel = best(results, design, tuned=tuned), axes[row, column]
+        for row in range(2):
+            one, panel = shown[row][column], axes[row, column]
             good = np.asarray(one.metrics.success)
             time = np.asarray(one.metrics.settling_time)
             drawn = panel.scatter(theta[good], rate[good], c=time[good], s=5, cmap="viridis", norm=norm)

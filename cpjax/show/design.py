@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 from cpjax.controllers import SWING_UP
 from cpjax.controllers.gates import Gate
 from cpjax.design.structure import Structure
-from cpjax.show.figures import DESIGN_NAMES
+from cpjax.show.figures import DESIGN_NAMES, GATE_COLOUR
 from cpjax.state import NAMES, UNITS, UPRIGHT, State
 from cpjax.study.design_check import DesignCheck
 
-_INK, _CLIP, _GATE = "#0072B2", "#D55E00", "#009E73"
+_INK, _CLIP = "#333333", "#CC79A7"
 
 COMPARISON = (
     "regulator",
@@ -95,7 +95,7 @@ def _plane(axes: Axes, check: DesignCheck, gate: Gate, voltage_limit: float) -> 
     x = zero + float(getattr(gate, "reference", UPRIGHT).x)
     margin = np.asarray(gate.margin(State(x, zero, theta, rate), jnp.full(theta.shape, SWING_UP)))
     degrees = np.degrees(theta)
-    axes.contour(degrees, rate, margin, levels=[0.0], colors=_GATE)
+    axes.contour(degrees, rate, margin, levels=[0.0], colors=GATE_COLOUR)
     demand = np.abs(K[2] * theta + K[3] * rate)
     if limited:
         axes.contourf(degrees, rate, demand, levels=[0.0, voltage_limit], colors=[_CLIP], alpha=0.25)
@@ -104,7 +104,7 @@ def _plane(axes: Axes, check: DesignCheck, gate: Gate, voltage_limit: float) -> 
         block = check.P[2:, 2:]
         form = block[0, 0] * theta**2 + 2 * block[0, 1] * theta * rate + block[1, 1] * rate**2
         axes.contourf(degrees, rate, form, levels=[0.0, check.level], colors=[_INK], alpha=0.7)
-    axes.plot([], [], color=_GATE, label="gate")
+    axes.plot([], [], color=GATE_COLOUR, label="gate")
     axes.fill_between([], [], color=_INK, alpha=0.7, label="certified level set")
     axes.set_xlabel(r"$\theta$ [deg]")
     axes.set_ylabel(r"$\dot\theta$ [rad/s]")

@@ -18,6 +18,7 @@ from cpjax.controllers import REGULATE, Hybrid, PoleFactors
 from cpjax.sim.rollout import Trajectory
 
 DESIGN_COLOURS: Mapping[str, str] = {"lqr": "#D55E00", "placement": "#0072B2"}
+GATE_COLOUR = "#E69F00"
 DESIGN_NAMES: Mapping[str, str] = {"lqr": "LQR", "placement": "pole placement"}
 _X, _THETA, _VOLTAGE, _CATCH = "#009E73", "#CC79A7", "#333333", "#999999"
 

@@ -107,23 +107,26 @@ def findings(curves: Mapping[tuple[float, str], Mapping[str, Curve]]) -> list[st
     """What the fronts say of the two methods and of gradients, a sentence for each supply and cost."""
     sentences = []
     for (supply, cost), designs in curves.items():
-        where = f"Settling time against {cost.replace('_', ' ')} at {supply:g} V: "
-        found = {design: curve for design, curve in designs.items() if curve.traced_volume}
-        if not found:
-            sentences.append(where + "gradients find no controller that settles from enough starts.")
-            continue
-        said = [
-            f"{DESIGN_NAMES[design]} settles after {curve.traced[0, 0]:.2f} s at the fastest, and random search "
-            f"dominates {abs(share):.0f} % {'less' if share >= 0 else 'more'} than its front"
-            for design, curve in found.items()
-            for share in [100.0 * (1.0 - curve.random_volume / curve.traced_volume)]
-        ]
-        if len(found) == 2:
-            ahead, behind = sorted(found, key=lambda design: -found[design].traced_volume)
-            lead = 100.0 * (1.0 - found[behind].traced_volume / found[ahead].traced_volume)
-            said.append(f"{DESIGN_NAMES[behind]} dominates {lead:.0f} % less than {DESIGN_NAMES[ahead]}")
-        sentences.append(where + "; ".join(said) + ".")
+        said = [f"{DESIGN_NAMES[design]} {_found(curve)}" for design, curve in designs.items()]
+        ordered = sorted(designs, key=lambda design: -designs[design].traced_volume)
+        most, least = (designs[design].traced_volume for design in (ordered[0], ordered[-1]))
+        if least > 0.0:
+            lead = 100.0 * (1.0 - least / most)
+            said.append(f"{DESIGN_NAMES[ordered[-1]]} dominates {lead:.0f} % less than {DESIGN_NAMES[ordered[0]]}")
+        sentences.append(f"Settling time against {cost.replace('_', ' ')} at {supply:g} V: {'; '.join(said)}.")
     return sentences
+
+
+def _found(curve: Curve) -> str:
+    """What either search finds of one design."""
+    if not len(curve.traced):
+        other = f"random search {len(curve.random)} points" if len(curve.random) else "neither does random search"
+        return f"has no point by gradients, {other}"
+    words = f"settles after {curve.traced[0, 0]:.2f} s at the fastest"
+    if not curve.traced_volume:
+        return f"{words}, beyond the reference of the hypervolume"
+    share = 100.0 * (1.0 - curve.random_volume / curve.traced_volume)
+    return f"{words}, and random search dominates {abs(share):.0f} % {'less' if share >= 0 else 'more'} than its front"
 
 
 def _draw(axes: Axes, design: str, curve: Curve) -> None:
@@ -142,6 +145,6 @@ def _verdict(designs: Mapping[str, Curve]) -> str:
         if curve.traced_volume:
             share = f"{100 * (curve.random_volume / curve.traced_volume - 1.0):+.0f} %"
         else:
-            share = "finds points, gradients none" if curve.random_volume else "none"
+            share = "some, of gradients none" if curve.random_volume else "none"
         parts.append(f"{DESIGN_NAMES[design]} {share}")
     return "hypervolume of random search:\n" + ", ".join(parts)

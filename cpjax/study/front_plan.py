@@ -1,10 +1,10 @@
 """How trade-off fronts are traced: what is traded, and how much work goes into it."""
 
 import dataclasses
-import math
 from typing import TypeAlias
 
-from cpjax.errors import InputError
+from cpjax.pytree import Number
+from cpjax.tune.plan import check_plan
 
 COSTS = ("effort", "cart_travel", "voltage_variation")
 """Of `Metrics`, against the settling time."""
@@ -79,22 +79,38 @@ class FrontPlan:
     success: float = 0.99
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if field.type in (int, "int"):
-                least = 0 if field.name in ("seed", "steps") else 1
-                if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                    raise InputError(field.name, value, f"a whole number, at least {least}")
-            elif field.name == "explore" and value == 0.0:
-                continue
-            elif isinstance(value, (bool, str)) or not 0.0 < value < math.inf:
-                raise InputError(field.name, value, "a finite number above 0")
-        for name, largest in (("lowest", 0.999), ("success", 1.0), ("exchange_from", 1.0)):
-            if getattr(self, name) > largest:
-                raise InputError(name, getattr(self, name), f"above 0 and at most {largest:g}")
-        if self.dearest < 1.0:
-            raise InputError("dearest", self.dearest, "at least 1")
-        for whole, part in (("duration", "dt"), ("horizon", "judging_dt"), ("horizon", "final_dt")):
-            steps = getattr(self, whole) / getattr(self, part)
-            if steps < 0.5 or abs(steps - round(steps)) > 1e-6 * steps:
-                raise InputError(part, getattr(self, part), f"a whole fraction of {whole}, {getattr(self, whole):g} s")
+        check_plan(self, _COUNTS, _NUMBERS, (("duration", "dt"), ("horizon", "judging_dt"), ("horizon", "final_dt")))
+
+
+_COUNTS = {
+    "seed": 0,
+    "bounds": 1,
+    "candidates": 1,
+    "screening": 1,
+    "steps": 0,
+    "batch": 1,
+    "variety": 1,
+    "judge_every": 1,
+    "judging": 1,
+    "semifinal": 1,
+    "final": 1,
+}
+_NUMBERS = {
+    "lowest": Number("1", "", above=0.0, below=1.0),
+    "fine": Number("1", "", above=0.0),
+    "price": Number("s", "", above=0.0),
+    "price_rate": Number("1", "", above=0.0),
+    "dearest": Number("1", "", at_least=1.0),
+    "exchange_from": Number("1", "", at_least=0.0, at_most=1.0),
+    "explore": Number("1", "", at_least=0.0),
+    "learning_rate": Number("1", "", above=0.0, at_most=10.0),
+    "clip": Number("1", "", above=0.0, infinite=True),
+    "duration": Number("s", "", above=0.0),
+    "dt": Number("s", "", above=0.0),
+    "spare_rate": Number("1/s", "", at_least=0.0),
+    "width": Number("rad and m", "", above=0.0),
+    "horizon": Number("s", "", above=0.0),
+    "judging_dt": Number("s", "", above=0.0),
+    "final_dt": Number("s", "", above=0.0),
+    "success": Number("1", "", above=0.0, at_most=1.0),
+}

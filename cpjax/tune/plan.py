@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -96,18 +96,8 @@ class Plan:
             raise InputError("aggregate", self.aggregate, "one of " + ", ".join(_AGGREGATES))
         if not isinstance(self.goal, Goal):
             raise InputError("goal", self.goal, "a cpjax.tune Goal")
-        for name, least in _COUNTS.items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise InputError(name, value, f"a whole number, at least {least}")
-        for name, rule in _NUMBERS.items():
-            object.__setattr__(self, name, rule.normalise(name, getattr(self, name)))
-        for whole, part in (("duration", "dt"), ("horizon", "horizon_dt"), ("final_horizon", "final_dt")):
-            try:
-                check_settings(getattr(self, whole), getattr(self, part), "continuous", None, "per_step", "rk4", None)
-            except InputError as problem:
-                field = part if problem.field == "dt" else whole
-                raise InputError(field, getattr(self, field), problem.allowed) from problem
+        steps = (("duration", "dt"), ("horizon", "horizon_dt"), ("final_horizon", "final_dt"))
+        check_plan(self, _COUNTS, _NUMBERS, steps)
         if self.restarts > self.candidates + 1:
             raise InputError("restarts", self.restarts, f"at most candidates + 1, {self.candidates + 1}")
 
@@ -128,6 +118,33 @@ class Plan:
     def table(self) -> dict[str, Any]:
         """As plain values."""
         return dataclasses.asdict(self)
+
+
+def check_plan(
+    plan: Any, counts: Mapping[str, int], numbers: Mapping[str, Number], steps: Sequence[tuple[str, str]]
+) -> None:
+    """Normalises a frozen plan's numbers; what its fields may be.
+
+    Args:
+      counts: names of whole numbers, and the least that each may be.
+      numbers: names of real ones, and their rules.
+      steps: pairs of a duration's name and that of the step which divides it.
+
+    Raises:
+      InputError: names the field.
+    """
+    for name, least in counts.items():
+        value = getattr(plan, name)
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise InputError(name, value, f"a whole number, at least {least}")
+    for name, rule in numbers.items():
+        object.__setattr__(plan, name, rule.normalise(name, getattr(plan, name)))
+    for whole, part in steps:
+        try:
+            check_settings(getattr(plan, whole), getattr(plan, part), "continuous", None, "per_step", "rk4", None)
+        except InputError as problem:
+            field = part if problem.field == "dt" else whole
+            raise InputError(field, getattr(plan, field), problem.allowed) from problem
 
 
 _AGGREGATES: Mapping[str, Callable[[Plan], Aggregate]] = {

@@ -10,6 +10,7 @@ import cpjax
 from cpjax import paper
 from cpjax.errors import InputError
 from cpjax.numeric.pareto import nondominated
+from cpjax.show.front import Curve, findings
 from cpjax.sim.metrics import TimeOutside
 from cpjax.study.front import FOLDS, GRADIENT_STEP, trace_fronts
 from cpjax.study.front_judge import Judged, layers
@@ -90,6 +91,21 @@ def test_layers_begin_with_what_no_other_beats_and_end_with_what_is_finite():
 def test_a_bad_plan_is_refused(change, field):
     with pytest.raises(InputError, match=field):
         FrontPlan(**change)
+
+
+def test_the_sentences_say_of_each_design_what_either_search_found():
+    def curve(traced, random, *volumes):
+        return Curve(np.reshape(traced, (-1, 2)), np.reshape(random, (-1, 2)), *volumes)
+
+    lqr, placement = curve([2.0, 9.0], [3.0, 9.0], 4.0, 5.0), curve([2.5, 9.0], [], 2.0, 0.0)
+    (both,) = findings({(12.0, "effort"): {"lqr": lqr, "placement": placement}})
+    assert "LQR settles after 2.00 s at the fastest, and random search dominates 25 % more than its front" in both
+    assert "pole placement dominates 50 % less than LQR" in both
+    lqr, placement = curve([], [3.0, 9.0], 0.0, 5.0), curve([9.0, 9.0], [], 0.0, 0.0)
+    (one,) = findings({(9.0, "effort"): {"lqr": lqr, "placement": placement}})
+    assert "LQR has no point by gradients, random search 1 points" in one
+    assert "pole placement settles after 9.00 s at the fastest, beyond the reference" in one
+    assert "less than" not in one
 
 
 @pytest.mark.slow
