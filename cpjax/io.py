@@ -14,6 +14,7 @@ import re
 import secrets
 import stat
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -173,6 +174,21 @@ def write_bytes(path: Path, content: bytes) -> None:
         if isinstance(problem, OSError):
             raise InputError("path", str(path), f"a place that can be written ({problem})") from problem
         raise
+
+
+def claim(path: Path, request: Mapping[str, Any]) -> None:
+    """Makes a folder, that of `path`, the place where parts of a long work are kept until it is done, or sees that it
+    is this work's. The file at `path` says which work that is.
+
+    Raises:
+      InputError: it is another's, or cannot be written.
+    """
+    asked = dump_json(request)
+    if not path.exists():
+        write_text(path, asked)
+    elif path.read_text(encoding="utf-8") != asked:
+        allowed = "a place without the parts of other work (other options, starts or versions); delete them first"
+        raise InputError("path", str(path.parent), allowed)
 
 
 def versions() -> dict[str, str]:

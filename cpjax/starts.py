@@ -38,14 +38,23 @@ def sample_starts(name: str, count: int, *, seed: int, dtype: Any = np.float64) 
     Raises:
       InputError: an unknown set, a count outside 1 to 10^8, a negative seed, or a dtype that is no float.
     """
+    check_starts(name, count, seed)
+    if not any(dtype is kind or dtype == np.dtype(kind) for kind in (np.float32, np.float64)):
+        raise InputError("dtype", dtype, "float32 or float64")
+    unit = np.random.default_rng(seed).uniform(-1.0, 1.0, size=(count, len(NAMES)))
+    columns = (centre + half * unit[:, i] for i, (centre, half) in enumerate(_SETS[name][n] for n in NAMES))
+    return State(*(column.astype(dtype) for column in columns))
+
+
+def check_starts(name: Any, count: Any, seed: Any) -> None:
+    """What `sample_starts` asks of these, without drawing any.
+
+    Raises:
+      InputError: as there.
+    """
     if not isinstance(name, str) or name not in _SETS:
         raise InputError("starts", name, "one of " + ", ".join(_SETS))
     if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= _MOST:
         raise InputError("count", count, f"a whole number, at least 1 and at most {_MOST}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise InputError("seed", seed, "a whole number, at least 0")
-    if not any(dtype is kind or dtype == np.dtype(kind) for kind in (np.float32, np.float64)):
-        raise InputError("dtype", dtype, "float32 or float64")
-    unit = np.random.default_rng(seed).uniform(-1.0, 1.0, size=(count, len(NAMES)))
-    columns = (centre + half * unit[:, i] for i, (centre, half) in enumerate(_SETS[name][n] for n in NAMES))
-    return State(*(column.astype(dtype) for column in columns))

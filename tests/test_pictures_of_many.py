@@ -12,10 +12,28 @@ from cpjax.show.figures import DESIGN_COLOURS
 from cpjax.study.recording import read_sweep
 
 
-def test_basin_writes_maps_whose_shares_are_those_of_the_runs_beside_them(command, tmp_path):
-    arguments = ("--cells", 6, "--theta", -1, 1, "--controllers", "tuned_place", "corrected/lqr", "--duration", 3)
-    done = command("basin", *arguments, "--x", -0.1, 0.1, "--out", tmp_path)
+def stop(*_, **__):
+    raise KeyboardInterrupt
+
+
+def test_basin_writes_maps_whose_shares_are_those_of_the_runs_beside_them_also_after_an_interruption(
+    command, tmp_path, monkeypatch
+):
+    odd = str(tmp_path / r"a $\frac$ [bold] <b>.json")  # a formula, a style or a tag, if anything takes it for one
+    cpjax.save(odd, cpjax.preset("placement"))
+    arguments = ("--cells", 6, "--theta", -1, 1, "--controllers", odd, "corrected/lqr", "--duration", 3)
+    arguments = ("basin", *arguments, "--x", -0.1, 0.1, "--out", tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr("cpjax.show.basin.basins", stop)
+        assert command(*arguments).code == 130
+    refused = command(*arguments, "--seed", 2)
+    assert refused.code == 2
+    assert "without the parts of other work" in refused.err
+    with monkeypatch.context() as patch:
+        patch.setattr("cpjax.cli.basin.record_sweep", stop)  # what is done is not done again
+        done = command(*arguments)
     assert done.code == 0, done.err
+    assert not (tmp_path / "basin.parts").exists()
     document = json.loads((tmp_path / "basin.json").read_text())
     assert document["map"]["others"] == {"x": [-0.1, 0.1]}
     for name, row in document["basins"].items():
@@ -23,7 +41,7 @@ def test_basin_writes_maps_whose_shares_are_those_of_the_runs_beside_them(comman
         assert row["share"] == np.mean(columns["success"])
         assert len(columns["success"]) == 36
         assert f"{100 * row['share']:.2f}" in done.out
-    assert document["basins"]["tuned_place"]["share"] > document["basins"]["corrected/lqr"]["share"]
+    assert document["basins"][odd]["share"] > document["basins"]["corrected/lqr"]["share"]
     assert (tmp_path / "basin.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -127,38 +145,59 @@ def test_without_an_encoder_a_film_becomes_a_page(command, tmp_path, monkeypatch
         (("basin", "--dt", "nan"), "dt"),
         (("pareto", "--bounds", "0"), "bounds"),
         (("pareto", "--supplies", "nan"), "supplies"),
+        (("pareto", "--supplies", "1e300"), "supplies"),
+        (("pareto", "--candidates", "1000000000000"), "candidates"),
+        (("basin", "--controllers", "corected/lqr"), "tuned_lqr, tuned_place, a law (as-printed, "),
+        (("basin", "--out", "o" * 300), "path = "),
+        (("basin", "--controllers", "\udcff.json"), "text in UTF-8"),
         (("animate", "--rate", "0"), "rate"),
         (("animate", "--duration", "nan"), "duration"),
         (("report", "--cells", "-1"), "cells"),
     ],
 )
 def test_bad_input_is_named_in_one_line(command, tmp_path, arguments, named):
-    done = command(*arguments, "--out", tmp_path)
+    done = command(arguments[0], "--out", tmp_path, *arguments[1:])
     assert done.code == 2
     assert named in done.err
     assert len(done.err.strip().splitlines()) <= 2  # progress, at most, before
 
 
+def trace_once(trace, stop):
+    """`trace`, that may be called once."""
+    calls = []
+
+    def traced(*arguments):
+        if calls:
+            stop()
+        calls.append(arguments)
+        return trace(*arguments)
+
+    return traced
+
+
 @pytest.mark.slow
 def test_pareto_keeps_a_finished_design_when_it_is_stopped(command, tmp_path, monkeypatch):
     from cpjax.cli import pareto
+    from cpjax.study.front import Tracer
 
     small = ("--bounds", 2, "--candidates", 64, "--steps", 2, "--final", 16, "--supplies", 12, "--out", tmp_path)
 
-    def stop(*_):
-        raise KeyboardInterrupt
-
+    with monkeypatch.context() as patch:
+        patch.setattr("cpjax.study.front._front", stop)  # after the searches of the first design
+        assert command("pareto", *small).code == 130
+    parts = tmp_path / "pareto.parts"
+    assert sorted(part.name for part in parts.rglob("*.npz")) == ["random.npz", "traced.npz"]
     with monkeypatch.context() as patch:
         patch.setattr(pareto, "compare", stop)
+        patch.setattr("cpjax.study.front.Tracer.trace", trace_once(Tracer.trace, stop))
         assert command("pareto", *small).code == 130
-    parts = sorted(tmp_path.glob("*.part.json"))
-    assert len(parts) == 2
+    assert len(list(parts.rglob("fronts.json"))) == 2
     other = command("pareto", *small, "--seed", 2)
     assert other.code == 2
-    assert "out = " in other.err
+    assert "without the parts of other work" in other.err
     with monkeypatch.context() as patch:
         patch.setattr("cpjax.study.front.trace_fronts", stop)  # nothing is traced again
         assert command("pareto", *small).code == 0
-    assert not list(tmp_path.glob("*.part.json"))
+    assert not parts.exists()
     document = json.loads((tmp_path / "pareto.json").read_text())
     assert {row["cost"] for row in document["fronts"]["lqr"]["rows"]} == {"effort", "cart_travel", "voltage_variation"}

@@ -75,8 +75,20 @@ def main(arguments: Sequence[str] | None = None, *, set_up: bool = False) -> int
       set_up: keep what is compiled for the next process, and set up the CPU where the command simulates many starts.
         Only before JAX has started.
     """
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        return _run(given, set_up)
+    except KeyboardInterrupt:
+        print(f"cpjax {given[0] if given else ''}: interrupted; what was saved so far is kept", file=sys.stderr)
+        return 130
+
+
+def _run(arguments: list[str], set_up: bool) -> int:
     parser = make_parser()
     try:
+        for text in arguments:
+            if not text.isascii() and text != text.encode(errors="replace").decode():
+                parser.error(f"argument {text!r}: allowed: text in UTF-8; other could be neither shown nor saved")
         options = parser.parse_args(arguments)
     except SystemExit as stop:  # argparse ends the process itself; as a function, main returns
         return int(stop.code or 0)
@@ -97,9 +109,10 @@ def main(arguments: Sequence[str] | None = None, *, set_up: bool = False) -> int
     except InputError as problem:
         print(f"cpjax {options.command}: error: {problem}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print(f"cpjax {options.command}: interrupted; what was saved so far is kept", file=sys.stderr)
-        return 130
+    except OSError as problem:  # a name too long, a disk that is full: what libraries have no better words for
+        said = InputError("path", problem.filename, f"a place that can be read and written ({problem.strerror})")
+        print(f"cpjax {options.command}: error: {said}", file=sys.stderr)
+        return 2
 
 
 def _version() -> str:

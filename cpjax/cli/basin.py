@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import math
+import shutil
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cpjax import io
-from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, named_hybrid, resolve
+from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, controller_title, named_hybrid, resolve
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
@@ -21,7 +22,7 @@ from cpjax.sim.metrics import Metrics
 from cpjax.state import NAMES, UNITS
 from cpjax.study.basin import MOST_CELLS, Axis, Map, area, document
 from cpjax.study.design_check import DesignCheck, check_design
-from cpjax.study.recording import record_sweep
+from cpjax.study.recording import read_sweep, record_sweep
 
 if TYPE_CHECKING:  # matplotlib takes a while; bad input should not wait for it
     from cpjax.show.basin import Panel
@@ -92,28 +93,32 @@ def run(given: argparse.Namespace) -> int:
 def drawn(
     out: Path, plant: CartPole, controllers: Mapping[str, Hybrid], chart: Map, setting: dict[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """The maps of all controllers in a few numbers, with basin.json, basin.png and their runs written."""
-    metrics = {name: mapped(out, plant, chart, name, one, setting) for name, one in controllers.items()}
+    """The maps of all controllers in a few numbers, with basin.json, basin.png and their runs written when all are
+    done. Until then the parts are in a folder of their own, and what an earlier map left stays as it is.
+    """
+    request = {
+        "what": "share of a map from which controllers settle: sampled, not certified",
+        "versions": io.versions(),
+        "map": dataclasses.asdict(chart),
+        "run": setting,
+        "plant": io.encode(plant),
+        "controllers": {name: io.encode(one) for name, one in controllers.items()},
+    }
+    parts = out / "basin.parts"
+    io.claim(parts / "request.json", request)
+    metrics = {name: mapped(parts, plant, chart, name, one, setting) for name, one in controllers.items()}
     rows = {name: document(chart, found) for name, found in metrics.items()}
-    io.write_json(
-        out / "basin.json",
-        {
-            "what": "share of a map from which controllers settle: sampled, not certified",
-            "versions": io.versions(),
-            "map": dataclasses.asdict(chart),
-            "run": setting,
-            "plant": io.encode(plant),
-            "controllers": {name: io.encode(one) for name, one in controllers.items()},
-            "basins": rows,
-            "files": {name: file_of(name) for name in controllers},
-        },
-    )
+    files = {name: file_of(name) for name in controllers}
+    io.write_json(out / "basin.json", {**request, "basins": rows, "files": files})
 
     from cpjax.show.basin import basins
     from cpjax.show.figures import save_figure
 
     panels = [panel_of(plant, chart, name, one, metrics[name]) for name, one in controllers.items()]
     save_figure(out / "basin.png", basins(chart, panels))
+    for file in files.values():
+        (parts / file).replace(out / file)
+    shutil.rmtree(parts)
     return rows
 
 
@@ -140,11 +145,15 @@ def file_of(name: str) -> str:
     return name.replace("/", "-").removesuffix(".json").removesuffix(".toml").lstrip(".-") + ".npz"
 
 
-def mapped(out: Path, plant: CartPole, chart: Map, name: str, controller: Hybrid, setting: dict[str, Any]) -> Metrics:
-    """The metrics of a controller's map, recorded in `out`."""
+def mapped(parts: Path, plant: CartPole, chart: Map, name: str, controller: Hybrid, setting: dict[str, Any]) -> Metrics:
+    """The metrics of a controller's map, recorded in `parts`, or from there where they are complete."""
+    path = parts / file_of(name)
+    if path.exists():
+        columns: dict[str, Any] = read_sweep(path)[1]
+        return Metrics(**{field.name: columns[field.name] for field in dataclasses.fields(Metrics)})
     with progress(name) as report:
         metrics: Metrics = record_sweep(
-            out / file_of(name),
+            path,
             plant,
             controller,
             chart.starts(),
@@ -161,7 +170,14 @@ def panel_of(plant: CartPole, chart: Map, name: str, controller: Hybrid, metrics
     from cpjax.show.basin import Panel
 
     found = area(chart, np.asarray(metrics.success))
-    return Panel(name, controller, float(plant.motor.voltage_limit), _checked(plant, controller), metrics, found)
+    return Panel(
+        controller_title(name),
+        controller,
+        float(plant.motor.voltage_limit),
+        _checked(plant, controller),
+        metrics,
+        found,
+    )
 
 
 def _checked(plant: CartPole, controller: Hybrid) -> DesignCheck | None:

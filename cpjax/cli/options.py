@@ -37,6 +37,8 @@ from cpjax.sim.integrators import INTEGRATORS
 from cpjax.starts import START_SETS, sample_starts
 from cpjax.state import NAMES, UNITS, State
 
+_LONG_NAME = 48  # more letters of a file's name have no place above a picture
+
 Sections: TypeAlias = Mapping[str, Mapping[str, Any]]
 """Values given by the user, by section and key. What was not given is absent."""
 
@@ -250,6 +252,9 @@ def saved_controller(name: str) -> Controller:
     for design, known in PRESETS.items():
         if name == known:
             return preset(design)
+    if Path(name).suffix.lower() not in (".json", ".toml"):
+        presets = ", ".join(PRESETS.values())
+        raise InputError("controller", name, f"{presets}, or the name of a file that ends in .json or .toml")
     try:
         return as_controller(io.load(name))
     except InputError as problem:
@@ -266,6 +271,10 @@ def named_hybrid(name: str, plant: CartPole) -> Hybrid:
             if others in ([design], [design, gains]):  # "printed" comes first
                 return paper.controller(law, design, plant, gains)
         raise InputError("controller", name, f"{law}/lqr or {law}/placement, and after it /printed or /computed")
+    if name not in PRESETS.values() and Path(name).suffix.lower() not in (".json", ".toml"):
+        presets, laws = ", ".join(PRESETS.values()), ", ".join(paper.LAWS)
+        allowed = f"{presets}, a law ({laws}) with its regulator, such as corrected/lqr, or a file (.json or .toml)"
+        raise InputError("controller", name, allowed)
     controller = saved_controller(name)
     if not isinstance(controller, Hybrid):
         raise InputError("controller", name, "a Hybrid: a regulator behind a gate")
@@ -280,7 +289,8 @@ def controller_title(name: str) -> str:
 
         rest = (DESIGN_NAMES.get(one, f"{one} gains") for one in others)
         return ", ".join([f"paper, {law.replace('-', ' ')}", *rest])
-    return {"tuned_lqr": "tuned, LQR", "tuned_place": "tuned, pole placement"}.get(name, name)
+    known = {"tuned_lqr": "tuned, LQR", "tuned_place": "tuned, pole placement"}
+    return known.get(name, name if len(name) <= _LONG_NAME else "..." + name[3 - _LONG_NAME :])
 
 
 def build_hybrid(given: Mapping[str, Any], plant: CartPole) -> Hybrid:

@@ -18,7 +18,10 @@ def progress(what: str) -> Iterator[Report]:
     if not sys.stderr.isatty():
         yield lambda done, total, text: print(f"{what}: {done}/{total} {text}", file=sys.stderr, flush=True)
         return
-    columns = (TextColumn("{task.fields[what]}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, TextColumn("{task.description}"), console=Console(stderr=True)) as bar:
+    what_it_is, what_comes = (
+        TextColumn(f"{{task.{field}}}", markup=False) for field in ("fields[what]", "description")
+    )
+    columns = (what_it_is, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), what_comes)
+    with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("", what=what)
         yield lambda done, total, text: bar.update(task, completed=done, total=total, description=text)

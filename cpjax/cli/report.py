@@ -1,9 +1,11 @@
 """`cpjax report`: the main job, as one self-contained HTML page."""
 
 import argparse
+import dataclasses
+import shutil
 from typing import Any
 
-from cpjax import __version__
+from cpjax import __version__, io, paper
 from cpjax.cli.options import EVALUATION_OPTIONS, Option, add_options, resolve
 from cpjax.cli.reproduce import print_rows, rows_of
 from cpjax.errors import InputError
@@ -40,13 +42,20 @@ def run(given: argparse.Namespace) -> int:
     if not 0 <= chosen.get("cells", 256) <= MOST_CELLS or chosen.get("cells") == 1:
         raise InputError("cells", chosen["cells"], f"0, or a whole number from 2 to {MOST_CELLS}")
     setting = Setting(seed=given.seed, **sections["evaluation"])
+    per_axis, studies = chosen.get("cells", 256), chosen.get("studies", "quick")
+    parts = given.out / "report.parts"
+    asked = {"setting": dataclasses.asdict(setting), "cells": per_axis, "studies": studies, "versions": io.versions()}
+    io.claim(parts / "request.json", asked)
     rows = rows_of(given, setting)
 
     from cpjax.cli import report_sections as sections_of  # matplotlib takes a while; bad input should not wait for it
-    from cpjax.show.figures import png, save_figure, success_rates
+    from cpjax.cli.compare import compared
+    from cpjax.show import comparison
+    from cpjax.show.figures import save_figure, success_rates
     from cpjax.show.page import Page
     from cpjax.show.reproduction import HEADER, cells, findings, pictures
 
+    results, shown_start = compared(given.out, paper.appendix_plant(), setting, {})
     page = Page(
         "Swing-up at 12 volts",
         "A student paper swings a pendulum up with an energy law and catches it with LQR or pole placement. "
@@ -67,11 +76,10 @@ def run(given: argparse.Namespace) -> int:
         "holds the cart near the middle."
     )
     page.section("What came out")
-    for sentence in findings(rows):
+    for sentence in (*findings(rows), comparison.findings(results)[-1]):
         page.text(sentence)
-    figure = success_rates(rows)
-    save_figure(given.out / "success.png", figure)
-    page.picture(png(figure), "Share of starts caught by each law, plant and regulator, with 95 % intervals.")
+    picture = save_figure(given.out / "success.png", success_rates(rows))
+    page.picture(picture, "Share of starts caught by each law, plant and regulator, with 95 % intervals.")
     page.table(HEADER, [cells(row) for row in rows], text_columns=4)
     page.note(
         "Settling, travel, effort and variation are over the successful runs, the peak voltage over all. "
@@ -79,15 +87,13 @@ def run(given: argparse.Namespace) -> int:
     )
     page.section("The paper's Figures 3 to 6, from our runs")
     for name, figure, caption in pictures(setting):
-        save_figure(given.out / f"{name}.png", figure)
-        page.picture(png(figure), caption)
-    per_axis, studies = chosen.get("cells", 256), chosen.get("studies", "quick")
+        page.picture(save_figure(given.out / f"{name}.png", figure), caption)
     sections_of.designs(page, given)
     sections_of.forensics(page, given)
     if studies != "none":
         sections_of.gradients(page, given, studies)
         sections_of.tuning(page, given, studies)
-    sections_of.comparison(page, given, setting)
+    sections_of.comparison(page, given, results, shown_start)
     if studies != "none":
         sections_of.animation(page, given)
     if per_axis:
@@ -102,6 +108,7 @@ def run(given: argparse.Namespace) -> int:
     )
     path = given.out / "report.html"
     page.write(path)
+    shutil.rmtree(parts)
     print_rows(rows)
     print(f"wrote {path}")
     return 0

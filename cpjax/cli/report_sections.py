@@ -8,7 +8,6 @@ from cpjax import io, paper
 from cpjax.cli import basin, pareto
 from cpjax.cli.animate import animated, verdict
 from cpjax.cli.audit_gradients import audited
-from cpjax.cli.compare import compared
 from cpjax.cli.options import controller_title, named_hybrid
 from cpjax.cli.progress import progress
 from cpjax.cli.tune import tuned
@@ -19,14 +18,15 @@ from cpjax.show import design as design_text
 from cpjax.show import forensics as forensics_text
 from cpjax.show import front as front_text
 from cpjax.show import gradients as gradients_text
-from cpjax.show.figures import DESIGN_NAMES, png, save_figure
+from cpjax.show.figures import DESIGN_NAMES, save_figure
 from cpjax.show.page import Page
 from cpjax.state import HANGING
+from cpjax.study.comparison import Compared
 from cpjax.study.design_check import check_design, document
 from cpjax.study.forensics import audit_gains, write
 from cpjax.study.front_plan import FrontPlan
 from cpjax.study.printed_gains import printed_in_the_paper
-from cpjax.study.reproduction import DESIGNS, Setting
+from cpjax.study.reproduction import DESIGNS
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
 from cpjax.tune.starting import beginning
@@ -60,7 +60,7 @@ def designs(page: Page, given: argparse.Namespace) -> None:
     page.text(
         "On the appendix's plant, linearised about upright, with the loop broken at the motor's voltage. Inside the "
         "certified level set the linear loop needs neither the 12 V clip nor the switch at 30 degrees; the last column "
-        "has its widest angle."
+        "has its widest angle, reached in motion. Leaning at rest in the middle, a smaller one saturates the voltage."
     )
     page.table(
         design_text.COMPARISON, [design_text.compared(*key, check) for key, check in checks.items()], text_columns=2
@@ -81,10 +81,8 @@ def forensics(page: Page, given: argparse.Namespace) -> None:
     )
     for sentence in forensics_text.findings(audit):
         page.text(sentence)
-    figure = forensics_text.picture(audit)
-    save_figure(given.out / "audit_gains.png", figure)
     page.picture(
-        png(figure),
+        save_figure(given.out / "audit_gains.png", forensics_text.picture(audit)),
         "Left: the worst residual when one or two parameters may change; a circle marks pairs that explain all eight "
         "gains. Right: how strongly the gains depend on each combination of parameters.",
     )
@@ -158,10 +156,8 @@ def tuning(page: Page, given: argparse.Namespace, size: str) -> None:
     )
 
 
-def comparison(page: Page, given: argparse.Namespace, setting: Setting) -> None:
-    """The paper's controllers beside the tuned ones."""
-    results, start = compared(given.out, paper.appendix_plant(), setting, {})
-
+def comparison(page: Page, given: argparse.Namespace, results: list[Compared], start: str) -> None:
+    """The paper's controllers beside the tuned ones, from what `cpjax.cli.compare.compared` returned."""
     page.section("Against tuned gains")
     page.text(
         "Energy gain, cart terms, gate and Q or poles, tuned together by gradients through whole swing-ups (`cpjax "
@@ -237,7 +233,8 @@ def fronts(page: Page, given: argparse.Namespace, size: str) -> None:
         "LQR or pole placement, and what does settling faster cost? Each point is a controller that settles from "
         f"{100 * plan.success:g} % of unseen starts at least, and that no other found beats in both. Traced by "
         "gradients, many tunings side by side under one `vmap`, each with a bound on its cost; a random search of as "
-        "many steps is drawn beside them. The hypervolumes reach up to 1.1 times the bland start."
+        "many steps is drawn beside them. The hypervolume of a front is the area that it dominates, up to 1.1 times "
+        "the bland start: the plain gains, chosen by rules of thumb, that every search begins with."
     )
     page.picture(
         (given.out / "pareto.png").read_bytes(),

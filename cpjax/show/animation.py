@@ -23,6 +23,7 @@ from PIL import Image
 from cpjax import io
 from cpjax.controllers import REGULATE
 from cpjax.errors import InputError
+from cpjax.show.figures import as_text
 from cpjax.sim.rollout import Trajectory
 
 FORMATS = ("gif", "mp4", "html")
@@ -104,7 +105,7 @@ def page(scenes: Sequence[Scene], duration: float, rate: float) -> str:
             }
         )
     setting = {"rate": rate, "half": _half_width(scenes, duration), "scenes": data}
-    return _PAGE.replace("__DATA__", json.dumps(setting).replace("</", "<\\/"))
+    return _PAGE.replace("__DATA__", json.dumps(setting).replace("<", "\\u003c"))
 
 
 def _sampled(run: Trajectory, duration: float, rate: float) -> tuple[np.ndarray[Any, Any], ...]:
@@ -136,7 +137,7 @@ class _Stage:
         axes.set_xlim(-half, half)
         axes.set_ylim(-1.75 * length, 1.35 * length)
         axes.set_aspect("equal")
-        axes.set_title(scene.title, fontsize="medium")
+        axes.set_title(as_text(scene.title), fontsize="medium")
         axes.set_xlabel("x [m]")
         axes.set_yticks([])
         axes.axhline(-0.5 * self._cart_size[1], color="0.6", linewidth=1.0)
@@ -147,6 +148,10 @@ class _Stage:
         (self._bob,) = axes.plot([], [], "o", color=scene.colour, markersize=9)
         low, high = -1.55 * length, 0.12 * length
         axes.add_patch(Rectangle((-0.8 * half, low), 1.6 * half, high, facecolor="none", edgecolor="0.4"))
+        if np.isfinite(scene.voltage_limit):
+            for sign, side in ((-1.0, "right"), (1.0, "left")):
+                end = f"{sign * scene.voltage_limit:+.4g} V"
+                axes.text(0.82 * sign * half, low + 0.5 * high, end, ha=side, va="center", fontsize="x-small")
         self._bar = Rectangle((0.0, low), 0.0, high, facecolor="#009E73")
         for patch in (self._cart, self._bar):
             axes.add_patch(patch)
@@ -305,7 +310,12 @@ function draw(i) {
     c.strokeRect(X(-0.8 * data.half), Y(-1.43 * L), 1.6 * data.half * scale, 0.12 * L * scale);
     c.fillStyle = "#009E73";
     c.fillRect(X(0), Y(-1.43 * L), 0.8 * data.half * scale * u / limit, 0.12 * L * scale);
-    c.fillStyle = ink; c.textAlign = "center"; c.font = "14px system-ui, sans-serif";
+    c.fillStyle = ink; c.font = "11px system-ui, sans-serif";
+    if (isFinite(scene.limit)) for (const sign of [-1, 1]) {
+      c.textAlign = sign < 0 ? "right" : "left";
+      c.fillText((sign < 0 ? "\u2212" : "+") + scene.limit + " V", X(0.82 * sign * data.half), Y(-1.53 * L));
+    }
+    c.textAlign = "center"; c.font = "14px system-ui, sans-serif";
     const away = Math.abs(x) > data.half ? "   x = " + x.toFixed(1) + " m" : "";
     c.fillText((scene.mode[i] ? "regulator" : "swing up") + "   " + u.toFixed(1) + " V" + away, X(0), Y(-1.33 * L));
   }

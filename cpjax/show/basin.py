@@ -12,7 +12,8 @@ from matplotlib.lines import Line2D
 
 from cpjax.controllers import Hybrid
 from cpjax.controllers.protocol import SWING_UP
-from cpjax.show.figures import GATE_COLOUR
+from cpjax.errors import InputError
+from cpjax.show.figures import GATE_COLOUR, as_text
 from cpjax.sim.metrics import Metrics
 from cpjax.state import NAMES, State
 from cpjax.study.basin import Area, Map
@@ -47,10 +48,15 @@ def basins(chart: Map, panels: Sequence[Panel]) -> Figure:
 
     Orange: the gate. Black: beyond, the regulator asks for more than the supply gives. Pink: the level set that the
     linear model certifies. All in the plane in which the other coordinates have their middle values.
+
+    Raises:
+      InputError: no panel.
     """
+    if not panels:
+        raise InputError("panels", panels, "one controller's map at least")
     figure = Figure(figsize=(1.2 + 4.3 * len(panels), 9.2), layout="constrained")
     axes = figure.subplots(2, len(panels), sharex=True, sharey=True, squeeze=False)
-    longest = max((_longest(panel.metrics) for panel in panels), default=1.0)
+    longest = max(_longest(panel.metrics) for panel in panels) or 1.0
     times = Normalize(0.0, longest)
     counts = BoundaryNorm(np.arange(-0.5, _MOST_SWITCHES + 1), _MOST_SWITCHES + 1)
     few = ListedColormap(["#440154", "#3b528b", "#21918c", "#5ec962", "#fde725", "#f0a0c8", "#a0305a"])
@@ -69,7 +75,7 @@ def basins(chart: Map, panels: Sequence[Panel]) -> Figure:
             _lines(panel_axes, chart, panel)
         found = panel.area
         axes[0, column].set_title(
-            f"{panel.title}\n{100 * found.share:.1f} % of the map: {found.value:.2f} ± {found.half_width:.2f} "
+            f"{as_text(panel.title)}\n{100 * found.share:.1f} % of the map: {found.value:.2f} ± {found.half_width:.2f} "
             f"{chart.across.unit} {chart.up.unit}",
             fontsize="medium",
         )

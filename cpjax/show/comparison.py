@@ -16,7 +16,7 @@ from cpjax.controllers import REGULATE, SWING_UP, Hybrid
 from cpjax.numeric.statistics import mcnemar_p_value
 from cpjax.numeric.trigonometry import wrap_angle
 from cpjax.plant import CartPole
-from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES, GATE_COLOUR
+from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES, GATE_COLOUR, SIDE_BY_SIDE
 from cpjax.sim.rollout import Trajectory
 from cpjax.state import State
 from cpjax.study.comparison import Compared, best
@@ -72,6 +72,8 @@ def _answer(results: Sequence[Compared], *, tuned: bool) -> str:
     caught_by_a, caught_by_b = (np.asarray(one.metrics.success) for one in (a, b))
     p = mcnemar_p_value(int(np.sum(caught_by_a & ~caught_by_b)), int(np.sum(caught_by_b & ~caught_by_a)))
     verdict = "a difference" if p < 1e-3 else "no difference at 99.9 %"
+    if mcnemar_p_value(len(caught_by_a), 0) >= 1e-3:
+        verdict = "too few starts to show a difference"
 
     def words(one: Compared) -> str:
         good = one.summary["over_successes"]
@@ -95,7 +97,7 @@ def responses(shown: Shown, until: float, limit: float, title: str) -> Figure:
     figure = Figure(figsize=(12, 8), layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots(3, 2, sharex=True, sharey="row")
-    for column, design in enumerate(DESIGNS):
+    for column, design in enumerate(SIDE_BY_SIDE):
         for kind, style in (("paper", "--"), ("tuned", "-")):
             one, run = shown[kind, design]
             time = np.asarray(run.time)
@@ -130,7 +132,7 @@ def phase_portraits(plant: CartPole, shown: Shown, title: str) -> Figure:
     per_lift = 4.0 * float(plant.pole_mass) * float(plant.gravity) * float(plant.pole_length)
     whole_turn = math.sqrt(per_lift / float(plant.pivot_inertia))  # hanging, with the energy of upright
     high = min(1.1 * max(fastest, whole_turn), 2.5 * whole_turn)  # a pole that spins leaves the view
-    for column, design in enumerate(DESIGNS):
+    for column, design in enumerate(SIDE_BY_SIDE):
         for row, kind in enumerate(("paper", "tuned")):
             panel, (one, run) = axes[row, column], shown[kind, design]
             _energy_and_gate(panel, plant, one.entry.controller, high)
@@ -190,7 +192,7 @@ def by_start(starts: State, results: Sequence[Compared]) -> Figure:
     figure = Figure(figsize=(12, 6.5), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     theta, rate = np.asarray(starts.theta), np.asarray(starts.theta_dot)
-    shown = [[best(results, design, tuned=tuned) for design in DESIGNS] for tuned in (False, True)]
+    shown = [[best(results, design, tuned=tuned) for design in SIDE_BY_SIDE] for tuned in (False, True)]
     metrics = [one.metrics for row in shown for one in row]
     times = np.concatenate([np.asarray(one.settling_time)[np.asarray(one.success)] for one in metrics])
     low, high = (float(np.min(times)), float(np.max(times))) if times.size else (1.0, 10.0)
@@ -198,7 +200,7 @@ def by_start(starts: State, results: Sequence[Compared]) -> Figure:
     high = max(high, 1.01 * low)
     norm = LogNorm(low, high)
     drawn: Any = None
-    for column, design in enumerate(DESIGNS):
+    for column, design in enumerate(SIDE_BY_SIDE):
         for row in range(2):
             one, panel = shown[row][column], axes[row, column]
             good = np.asarray(one.metrics.success)

@@ -13,13 +13,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cpjax import io
+from cpjax import io, paper
 from cpjax.controllers import REGULATE, Hybrid, PoleFactors
 from cpjax.sim.rollout import Trajectory
 
 DESIGN_COLOURS: Mapping[str, str] = {"lqr": "#D55E00", "placement": "#0072B2"}
 GATE_COLOUR = "#E69F00"
 DESIGN_NAMES: Mapping[str, str] = {"lqr": "LQR", "placement": "pole placement"}
+SIDE_BY_SIDE: tuple[paper.Design, ...] = ("lqr", "placement")
+"""From left to right, as the paper's Figures 3 and 4."""
 _X, _THETA, _VOLTAGE, _CATCH = "#009E73", "#CC79A7", "#333333", "#999999"
 
 
@@ -29,6 +31,11 @@ def design_colour(controller: Hybrid) -> str:
     return DESIGN_COLOURS["placement" if placed else "lqr"]
 
 
+def as_text(words: str) -> str:
+    """Words as matplotlib shall print them: without this it takes what is between two dollars for a formula."""
+    return words.replace("$", r"\$")
+
+
 def png(figure: Figure) -> bytes:
     """The figure as a PNG file's content."""
     buffer = buffers.BytesIO()
@@ -36,9 +43,11 @@ def png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def save_figure(path: Path, figure: Figure) -> None:
-    """Writes a PNG atomically."""
-    io.write_bytes(path, png(figure))
+def save_figure(path: Path, figure: Figure) -> bytes:
+    """Writes a PNG atomically; its content."""
+    content = png(figure)
+    io.write_bytes(path, content)
+    return content
 
 
 def response(trajectory: Trajectory, title: str, until: float, voltage_limit: float) -> Figure:
@@ -58,7 +67,7 @@ def paper_figures(trajectories: Mapping[Any, Trajectory], title: str, until: flo
     """Our runs in the places of the paper's Figures 3 (LQR), 4 (pole placement), 5 and 6 (their voltages)."""
     figure = Figure(figsize=(12, 8.5), layout="constrained")
     axes = figure.subplots(3, 2, sharex=True, sharey="row")
-    for column, (design, response_number, voltage_number) in enumerate((("lqr", 3, 5), ("placement", 4, 6))):
+    for column, (design, response_number, voltage_number) in enumerate(zip(SIDE_BY_SIDE, (3, 4), (5, 6), strict=True)):
         trajectory = trajectories[design]
         _positions(axes[0, column], trajectory)
         _rates(axes[1, column], trajectory)

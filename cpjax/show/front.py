@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from cpjax.errors import InputError
 from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES
 
 COST_LABELS = {
@@ -60,8 +61,7 @@ def fronts(
         shown = np.concatenate(
             [*(np.concatenate([c.traced, c.random]) for c in designs.values()), [*bland[cost].values()]]
         )
-        low, high = np.nanmin(shown, axis=0), np.nanmax(shown, axis=0)
-        low, high = low - 0.12 * (high - low), high + 0.12 * (high - low)
+        low, high = _view(shown)
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
         for one in known[cost]:
@@ -84,8 +84,24 @@ def fronts(
     return figure
 
 
+def _view(shown: np.ndarray[Any, Any]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Lower left and upper right corner, with some room around the finite points of those (n, 2)."""
+    finite = shown[np.all(np.isfinite(shown), axis=1)]
+    if not len(finite):
+        return np.zeros(2), np.ones(2)
+    low, high = np.min(finite, axis=0), np.max(finite, axis=0)
+    room = np.where(high > low, 0.12 * (high - low), 0.12 * np.maximum(np.abs(high), 1e-9))
+    return low - room, high + room
+
+
 def by_supply(curves: Mapping[float, Mapping[str, Curve]]) -> Figure:
-    """Settling time against effort, a panel for each supply."""
+    """Settling time against effort, a panel for each supply.
+
+    Raises:
+      InputError: no supply.
+    """
+    if not curves:
+        raise InputError("curves", curves, "the fronts of one supply at least")
     figure = Figure(figsize=(4.2 * len(curves), 4.6), layout="constrained")
     panels = figure.subplots(1, len(curves), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (supply, designs) in zip(panels, sorted(curves.items()), strict=True):

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from cpjax import paper
 from cpjax.numeric.statistics import two_proportion_p_value
-from cpjax.show.figures import DESIGN_NAMES, paper_figures
+from cpjax.show.figures import DESIGN_NAMES, SIDE_BY_SIDE, paper_figures
 from cpjax.study.reproduction import Setting, representative, trajectory
 
 SHOWN = (("as-printed", "appendix", 10.0), ("corrected-centred", "appendix", 10.0))
@@ -57,15 +57,13 @@ def cells(row: Mapping[str, Any]) -> list[str]:
 def pictures(setting: Setting) -> list[tuple[str, Figure, str]]:
     """Our Figures 3 to 6: for each law of `SHOWN` a file name, the figure, and its caption."""
     results = []
-    designs: tuple[paper.Design, ...] = ("lqr", "placement")
     for law, plant, until in SHOWN:
-        described = {design: representative(law, design, plant, setting) for design in designs}
-        runs = {d: trajectory(law, d, plant, described[d][1], setting) for d in designs}
-        words = "; ".join(f"{DESIGN_NAMES[d]} from {w}" for d, (w, _) in described.items())
+        words, start = representative(law, plant, setting)
+        runs = {design: trajectory(law, design, plant, start, setting) for design in SIDE_BY_SIDE}
         limit = float(paper.PLANTS[plant]().motor.voltage_limit)
         title = f"law {law}, printed gains, {plant} plant"
         outcome = "; ".join(f"{DESIGN_NAMES[d]} {_outcome(run.metrics)}" for d, run in runs.items())
-        caption = f"Our runs in the places of the paper's Figures 3 to 6 ({title}). Starts: {words}. Result: {outcome}."
+        caption = f"Our runs in the places of the paper's Figures 3 to 6 ({title}), from {words}. Result: {outcome}."
         results.append(
             (f"figures-3-6-{law}-{plant}", paper_figures(runs, title, min(until, setting.duration), limit), caption)
         )

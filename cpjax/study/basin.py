@@ -11,12 +11,15 @@ from typing import Any
 import numpy as np
 
 from cpjax.errors import InputError
+from cpjax.numeric.statistics import wilson_interval
+from cpjax.pytree import Number
 from cpjax.sim.metrics import Metrics
 from cpjax.state import NAMES, UNITS, State
 
 MOST_CELLS = 4096
 """Along one axis."""
 _SIGMAS = 1.959963984540054  # of a normal distribution, that hold 95 %
+_FINITE = Number("SI unit", "")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,9 +35,7 @@ class Axis:
         if self.name not in NAMES:
             raise InputError("Axis.name", self.name, "one of " + ", ".join(NAMES))
         for name in ("low", "high"):
-            value = getattr(self, name)
-            if isinstance(value, (bool, str)) or not math.isfinite(value):
-                raise InputError(f"Axis.{name}", value, "a finite number")
+            object.__setattr__(self, name, _FINITE.normalise(f"Axis.{name}", getattr(self, name)))
         if not self.low < self.high:
             raise InputError("Axis.high", self.high, f"above low, {self.low}")
         if isinstance(self.cells, bool) or not isinstance(self.cells, int) or not 2 <= self.cells <= MOST_CELLS:
@@ -74,7 +75,10 @@ class Map:
         for name, ends in self.others.items():
             if name not in free:
                 raise InputError("Map.others", name, "one of " + ", ".join(free))
-            if len(ends) != 2 or not all(math.isfinite(end) for end in ends) or not ends[0] <= ends[1]:
+            if not isinstance(ends, (tuple, list)) or len(ends) != 2:
+                raise InputError(f"Map.others[{name}]", ends, "two finite numbers, the lower one first")
+            low, high = (_FINITE.normalise(f"Map.others[{name}]", end) for end in ends)
+            if low > high:
                 raise InputError(f"Map.others[{name}]", ends, "two finite numbers, the lower one first")
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise InputError("Map.seed", self.seed, "a whole number, at least 0")
@@ -132,14 +136,19 @@ def area(chart: Map, success: np.ndarray[Any, Any]) -> Area:
 
     One random start in each cell is a stratified sample. Its mean is unbiased, and its variance is that within the
     cells alone: estimated from the differences of neighbours, which can only make it too large on average (Wolter,
-    Introduction to Variance Estimation, 2007, ch. 8).
+    Introduction to Variance Estimation, 2007, ch. 8). Where all succeed or none does, there are no differences: then
+    the other end of Wilson's interval says how large a part may have been missed.
     """
     caught = np.asarray(success, float).reshape(chart.shape)
     differences = [np.mean(np.diff(caught, axis=axis) ** 2) for axis in (0, 1)]
     deviation = math.sqrt(0.5 * float(np.mean(differences)) / caught.size)
     whole = (chart.across.high - chart.across.low) * (chart.up.high - chart.up.low)
     share = float(np.mean(caught))
-    return Area(share * whole, _SIGMAS * deviation * whole, share)
+    half_width = _SIGMAS * deviation
+    if share in (0.0, 1.0):
+        low, high = wilson_interval(int(np.sum(caught)), caught.size)
+        half_width = high - low
+    return Area(share * whole, half_width * whole, share)
 
 
 def document(chart: Map, metrics: Metrics) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import functools
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -33,6 +34,7 @@ from cpjax.sim.rollout import measure
 from cpjax.state import State
 from cpjax.study.front_judge import BATCH, EXPLORE, FINAL, JUDGE, SEMIFINAL, Judge, Judged, layers, together
 from cpjax.study.front_plan import COSTS, FrontPlan, Lane
+from cpjax.study.front_search import Search, remembered
 from cpjax.study.front_yardstick import lanes
 from cpjax.tune import descent
 from cpjax.tune.objective import Effort, Jerkiness, PricedTime, Travel, Unfinished
@@ -89,6 +91,7 @@ def trace_fronts(
     *,
     supplies: tuple[float, ...] = (),
     report: Report,
+    memory: Path | None = None,
 ) -> Fronts:
     """The fronts of settling time against every cost at the plant's own supply, and against effort at others.
 
@@ -96,6 +99,8 @@ def trace_fronts(
       reference: of the hypervolumes; see `front_yardstick`.
       supplies: further voltage limits [V].
       report: called with the parts done, their number, and what they are.
+      memory: a folder in which each of the two searches is saved when it is done. A call that finds one there goes on
+        from it; the folder is to be that of the same plant, design, plan and supplies.
 
     Raises:
       InputError: a plant without a voltage limit.
@@ -104,27 +109,41 @@ def trace_fronts(
     everywhere = list(dict.fromkeys(supply for supply, _ in wanted))
     parts = plan.steps + len(everywhere) + 2 * len(wanted)
     judge = Judge(plant, design, plan)
-    report(0, parts, "screening candidates")
-    begun = {supply: judge.begin(supply, plan.candidates, 0) for supply in everywhere}
-    tracer = Tracer(judge, plan)
-    met = tracer.trace(begun, wanted, lambda done, text: report(done, parts, text))
-    values = judge.steps
 
-    # For each supply as much work; as many as the tracing's will be judged a second time, the rest goes into screening.
-    judge.steps = Counter()
-    drawn = {}
-    run = round(plan.horizon / plan.judging_dt)
-    for number, supply in enumerate(everywhere):
-        report(plan.steps + number, parts, f"random search of the same cost, {supply:g} V")
-        budget = values[supply] + GRADIENT_STEP * tracer.steps[supply] - run * plan.judging * len(begun[supply].vectors)
-        drawn[supply] = judge.begin(supply, max(1, int(budget / (run * plan.screening))), 1)
+    def trace() -> Search:
+        judge.steps = Counter()
+        report(0, parts, "screening candidates")
+        begun = {supply: judge.begin(supply, plan.candidates, 0) for supply in everywhere}
+        tracer = Tracer(judge, plan)
+        met = tracer.trace(begun, wanted, lambda done, text: report(done, parts, text))
+        return Search(met, {supply: len(one.vectors) for supply, one in begun.items()}, judge.steps, tracer.steps)
+
+    def draw() -> Search:
+        # For each supply as much work; as many as the tracing's are judged a second time, the rest goes into screening.
+        judge.steps = Counter()
+        drawn = {}
+        run = round(plan.horizon / plan.judging_dt)
+        for number, supply in enumerate(everywhere):
+            report(plan.steps + number, parts, f"random search of the same cost, {supply:g} V")
+            budget = traced.values[supply] + GRADIENT_STEP * traced.gradients[supply]
+            budget -= run * plan.judging * traced.begun[supply]
+            drawn[supply] = judge.begin(supply, max(1, int(budget / (run * plan.screening))), 1)
+        counts = {supply: len(one.vectors) for supply, one in drawn.items()}
+        return Search(drawn, counts, judge.steps, dict.fromkeys(everywhere, 0))
+
+    traced = remembered(memory and memory / "traced.npz", trace)
+    random = remembered(memory and memory / "random.npz", draw)
     steps = {
-        supply: {"values": values[supply], "gradients": tracer.steps[supply], "random": judge.steps[supply]}
+        supply: {
+            "values": traced.values[supply],
+            "gradients": traced.gradients[supply],
+            "random": random.values[supply],
+        }
         for supply in everywhere
     }
 
     fronts: list[dict[Lane, Front]] = []
-    for which, found in enumerate((met, drawn)):
+    for which, found in enumerate((traced.met, random.met)):
         fronts.append({})
         for number, lane in enumerate(wanted):
             report(parts - (2 - which) * len(wanted) + number, parts, "measuring the points")

@@ -79,7 +79,7 @@ def record_sweep(
     first = jax.process_index() == 0
     parts = [folder / f"part-{begin:09d}-{min(begin + work.size, work.total):09d}.npz" for begin in work.begins()]
     if first:
-        _claim(folder, {**document, "starts": _digest(work)})
+        io.claim(folder / "sweep.json", {**document, "starts": _digest(work)})
     done = np.array([part.exists() for part in parts])
     if jax.process_count() > 1:
         done = np.asarray(multihost_utils.broadcast_one_to_all(done))
@@ -145,17 +145,6 @@ def _pyarrow() -> Any:
 
 def _described(component: Any) -> Any:
     return io.encode(component) if type(component) in io.TYPES.values() else type(component).__name__
-
-
-def _claim(folder: Path, request: dict[str, Any]) -> None:
-    """Makes the folder this sweep's, or sees that it is."""
-    path = folder / "sweep.json"
-    asked = io.dump_json(request)
-    if path.exists() and path.read_text(encoding="utf-8") != asked:
-        allowed = "a place without the parts of another sweep (other arguments, starts or versions); delete them first"
-        raise InputError("path", str(folder), allowed)
-    if not path.exists():
-        io.write_text(path, asked)
 
 
 def _digest(work: Work) -> str:

@@ -15,7 +15,7 @@ from cpjax.sim.metrics import Metrics
 from cpjax.sim.rollout import Trajectory, rollout
 from cpjax.sim.settings import check_settings
 from cpjax.sim.sweep import sweep
-from cpjax.starts import sample_starts
+from cpjax.starts import check_starts, sample_starts
 from cpjax.state import HANGING, State
 from cpjax.study.summary import summarise
 
@@ -35,13 +35,21 @@ class Variant:
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """How the protocol's evaluation runs are made: RK4, the sampled clock with one control instant a step."""
+    """How the protocol's evaluation runs are made: RK4, the sampled clock with one control instant a step.
+
+    Raises:
+      InputError: a value outside its range.
+    """
 
     starts: str = "hanging"
     count: int = 4096
     seed: int = 1
     duration: float = 20.0
     dt: float = 0.002
+
+    def __post_init__(self) -> None:
+        check_settings(self.duration, self.dt, "sampled", None, "per_step", "rk4", None)
+        check_starts(self.starts, self.count, self.seed)
 
 
 def variants() -> list[Variant]:
@@ -70,9 +78,8 @@ def reproduce(
         versions, found there, are not computed again; after changing the code, choose another path.
 
     Raises:
-      InputError: a setting outside its range, or a `path` that cannot be written.
+      InputError: a `path` that cannot be written.
     """
-    check_settings(setting.duration, setting.dt, "sampled", None, "per_step", "rk4", None)
     starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
     todo = variants()
     rows = _resume(path, setting) if path is not None else []
@@ -87,22 +94,22 @@ def reproduce(
     return rows
 
 
-def representative(law: str, design: paper.Design, plant: str, setting: Setting) -> tuple[str, State]:
-    """A start to show one variant by, with what it is in words.
+def representative(law: str, plant: str, setting: Setting) -> tuple[str, State]:
+    """A start to show a law with both regulators by, with what it is in words.
 
-    Exactly hanging at rest, for a law that starts from there; for one that does not, the start of the set whose
-    settling time is the median of the successful ones, or the set's first start if none is.
+    Exactly hanging at rest, for a law that starts from there. For one that does not, of the starts that both catch with
+    the printed gains the one whose longer settling time is the median; or the set's first start if there is none.
     """
     if law.startswith("corrected") and law != "corrected-as-voltage":
         return "exactly hanging at rest", HANGING
     starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
-    metrics = evaluate(Variant(law, plant, design, "printed"), setting, starts)
-    times = np.where(np.asarray(metrics.success), np.asarray(metrics.settling_time), np.inf)
+    both = [evaluate(Variant(law, plant, design, "printed"), setting, starts) for design in DESIGNS]
+    times = np.max([np.where(one.success, np.asarray(one.settling_time), np.inf) for one in both], axis=0)
     successes = int(np.isfinite(times).sum())
     index = int(np.argsort(times)[(successes - 1) // 2]) if successes else 0
-    words = "the median success" if successes else "the first start"
+    words = "the median of those that both catch," if successes else "the first, for both catch none,"
     start: State = jax.tree.map(lambda column: float(column[index]), starts)
-    return f"{words} of {setting.count} {setting.starts} starts (number {index})", start
+    return f"{words} of {setting.count} {setting.starts} starts (number {index + 1})", start
 
 
 def trajectory(law: str, design: paper.Design, plant: str, start: State, setting: Setting) -> Trajectory:

@@ -135,8 +135,9 @@ def check_plan(
     """
     for name, least in counts.items():
         value = getattr(plan, name)
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise InputError(name, value, f"a whole number, at least {least}")
+        most, also = (math.inf, "") if name == "seed" else (_MOST, f" and at most {_MOST}")
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            raise InputError(name, value, f"a whole number, at least {least}{also}")
     for name, rule in numbers.items():
         object.__setattr__(plan, name, rule.normalise(name, getattr(plan, name)))
     for whole, part in steps:
@@ -146,6 +147,8 @@ def check_plan(
             field = part if problem.field == "dt" else whole
             raise InputError(field, getattr(plan, field), problem.allowed) from problem
 
+
+_MOST = 10_000_000  # of whatever is counted: more would not fit a memory
 
 _AGGREGATES: Mapping[str, Callable[[Plan], Aggregate]] = {
     "tail": lambda plan: tail_mean(plan.tail),

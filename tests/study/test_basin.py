@@ -42,6 +42,14 @@ def test_the_area_of_a_disc_lies_in_its_interval_and_the_interval_shrinks_with_t
     assert np.mean(widths) < binomial * {20: 0.6, 60: 0.35}[cells]
 
 
+def test_of_a_map_without_a_boundary_the_interval_says_what_may_have_been_missed():
+    chart = Map(Axis("x", 0.0, 1.0, 10), Axis("x_dot", 0.0, 2.0, 10))
+    for success in (True, False):
+        found = area(chart, np.full(100, success))
+        assert found.value == 2.0 * success
+        assert found.half_width == pytest.approx(2.0 * 1.96**2 / (100 + 1.96**2), rel=1e-3)  # Wilson's, at 0 of 100
+
+
 def test_a_cells_outcome_is_that_of_a_rollout_from_its_start():
     plant, controller = paper.appendix_plant(), cpjax.preset("placement")
     chart = Map(Axis("theta", -1.0, 1.0, 3), Axis("theta_dot", -4.0, 4.0, 3))
@@ -64,7 +72,10 @@ def test_a_cells_outcome_is_that_of_a_rollout_from_its_start():
         (lambda: Axis("phi", 0.0, 1.0), "Axis.name"),
         (lambda: Axis("x", 1.0, 1.0), "Axis.high"),
         (lambda: Axis("x", math.nan, 1.0), "Axis.low"),
+        (lambda: Axis("x", None, 1.0), "Axis.low"),
         (lambda: Axis("x", 0.0, 1.0, 1), "Axis.cells"),
+        (lambda: Map(ANGLE, RATE, {"x": 0.0}), r"Map.others\[x\]"),
+        (lambda: Map(ANGLE, RATE, {"x": (0.0, "1")}), r"Map.others\[x\]"),
         (lambda: Map(ANGLE, ANGLE), "Map.up"),
         (lambda: Map(ANGLE, RATE, {"theta": (0.0, 0.0)}), "Map.others"),
         (lambda: Map(ANGLE, RATE, {"x": (1.0, 0.0)}), r"Map.others\[x\]"),

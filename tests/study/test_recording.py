@@ -105,7 +105,7 @@ def test_parts_of_another_sweep_are_refused(tmp_path):
     )
     for other in others:
         given = {"plant": PLANT, "controller": CENTRED, "starts": STARTS, **SETTINGS, **other}
-        with pytest.raises(InputError, match="a place without the parts of another sweep"):
+        with pytest.raises(InputError, match="a place without the parts of other work"):
             record_sweep(path, **given)
 
 
