@@ -78,6 +78,7 @@ def test_a_batch_too_large_for_one_core_stays_shared_out():
     assert WHOLE not in lowered(jax.vmap(lambda theta: effort(near(theta), CENTRED)), starts)
 
 
+@pytest.mark.slow
 def test_a_jaxlib_that_was_not_tested_is_told_nothing_and_gives_the_same(monkeypatch):
     def cost(theta):
         return effort(near(theta), CENTRED, clock="continuous")

@@ -56,7 +56,7 @@ class FrontPlan:
     price: float = 3.0
     price_rate: float = 1.0
     dearest: float = 100.0
-    candidates: int = 8192
+    candidates: int = 16384
     screening: int = 16
     steps: int = 100
     batch: int = 8
@@ -67,7 +67,7 @@ class FrontPlan:
     spare_rate: float = 20.0
     width: float = 0.05
     variety: int = 16
-    judge_every: int = 10
+    judge_every: int = 4
     exchange_from: float = 0.4
     explore: float = 0.15
     judging: int = 96
