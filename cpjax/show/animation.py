@@ -177,7 +177,7 @@ class _Stage:
 
 def _pictures(scenes: Sequence[Scene], duration: float, rate: float, report: Report | None) -> Iterator[Image.Image]:
     half = _half_width(scenes, duration)
-    height = 3.9 * 1.55 * max(scene.length for scene in scenes) / half + 1.1  # as high as the view is wide
+    height = 3.9 * 1.55 * max(scene.length for scene in scenes) / half + 1.25  # as high as the view is wide
     figure = Figure(figsize=(4.2 * len(scenes), max(2.6, height)), dpi=80, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     stages = [

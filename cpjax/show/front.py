@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
 from cpjax.errors import InputError
 from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES
@@ -71,9 +72,9 @@ def fronts(
             at = np.clip([one.time, one.cost], low, high)
             style = {"color": DESIGN_COLOURS[one.design], "fillstyle": "none", "markersize": 9, "clip_on": False}
             axes.plot(*at, _MARKERS.get(one.label, "D"), label=label, **style)
-        axes.set_xlabel("mean settling time [s]")
+        _time_axis(axes)
         axes.set_ylabel("mean " + COST_LABELS[cost])
-        axes.grid(alpha=0.3, which="both")
+        axes.grid(alpha=0.3)
         axes.set_title(_verdict(designs), fontsize="medium")
     handles = {
         label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
@@ -88,10 +89,21 @@ def _view(shown: np.ndarray[Any, Any]) -> tuple[np.ndarray[Any, Any], np.ndarray
     """Lower left and upper right corner, with some room around the finite points of those (n, 2)."""
     finite = shown[np.all(np.isfinite(shown), axis=1)]
     if not len(finite):
-        return np.zeros(2), np.ones(2)
-    low, high = np.min(finite, axis=0), np.max(finite, axis=0)
+        return np.array([1.0, 0.0]), np.array([10.0, 1.0])
+    scaled = np.stack([np.log(finite[:, 0]), finite[:, 1]], axis=1)  # as `_time_axis` does
+    low, high = np.min(scaled, axis=0), np.max(scaled, axis=0)
     room = np.where(high > low, 0.12 * (high - low), 0.12 * np.maximum(np.abs(high), 1e-9))
-    return low - room, high + room
+    low, high = low - room, high + room
+    return np.array([np.exp(low[0]), low[1]]), np.array([np.exp(high[0]), high[1]])
+
+
+def _time_axis(axes: Axes) -> None:
+    """Logarithmic: the bend of a front is at its fast end."""
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(FixedLocator([1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 15, 20]))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xlabel("mean settling time [s]")
 
 
 def by_supply(curves: Mapping[float, Mapping[str, Curve]]) -> Figure:
@@ -112,8 +124,8 @@ def by_supply(curves: Mapping[float, Mapping[str, Curve]]) -> Figure:
                 0.5, 0.5, "no controller found\nthat settles from enough starts", ha="center", transform=axes.transAxes
             )
         axes.set_title(f"{supply:g} V\n{_verdict(designs)}", fontsize="medium")
-        axes.set_xlabel("mean settling time [s]")
-        axes.grid(alpha=0.3, which="both")
+        _time_axis(axes)
+        axes.grid(alpha=0.3)
     panels[0].set_ylabel("mean " + COST_LABELS["effort"])
     panels[0].legend(frameon=False, fontsize="small")
     return figure
