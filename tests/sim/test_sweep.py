@@ -186,6 +186,7 @@ def in_a_process(script, *arguments):
     )
 
 
+@pytest.mark.slow
 def test_with_the_compilers_options_and_on_eight_devices_a_sweep_gives_the_same(tmp_path):
     """The options change what is computed twice, and with it the last bits; the number of devices changes nothing."""
     for name, kind, block in (("plain", "plain", 1000), ("eight", "configured", 1000), ("blocks", "configured", 128)):

@@ -58,6 +58,7 @@ def test_where_none_settles_from_enough_starts_those_count_that_nearly_match_the
     assert met.ladder("effort", FrontPlan(bounds=2)).tolist() == pytest.approx([8.5, 20.0, math.inf])
 
 
+@pytest.mark.slow
 def test_the_reference_is_the_same_for_both_designs_and_beyond_their_bland_starts():
     found = yardstick(PLANT, FrontPlan(final=64))
     for lane in lanes(PLANT):
