@@ -5,6 +5,7 @@ Python floats stay numbers, float64 arrays are plain lists, other arrays are tab
 infinities, so there they are the strings "inf", "-inf" and "nan".
 """
 
+import contextlib
 import dataclasses
 import importlib.metadata
 import json
@@ -12,9 +13,10 @@ import math
 import os
 import re
 import secrets
+import shutil
 import stat
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -176,19 +178,49 @@ def write_bytes(path: Path, content: bytes) -> None:
         raise
 
 
-def claim(path: Path, request: Mapping[str, Any]) -> None:
-    """Makes a folder, that of `path`, the place where parts of a long work are kept until it is done, or sees that it
-    is this work's. The file at `path` says which work that is.
+@contextlib.contextmanager
+def parts_of(folder: Path, request: Mapping[str, Any]) -> Iterator[Path]:
+    """A folder for the parts of a long work. It is gone when the work is done, or ends before it has saved any; if
+    anything else stops the work, the parts stay for the next time that the same is asked for.
 
     Raises:
-      InputError: it is another's, or cannot be written.
+      InputError: as `claim` does.
+    """
+    path = folder / "request.json"
+    claim(path, request)
+    try:
+        yield folder
+    except BaseException:
+        if [*folder.iterdir()] == [path]:
+            release(folder)
+        raise
+    release(folder)
+
+
+def claim(path: Path, request: Mapping[str, Any]) -> None:
+    """Makes the folder of `path` the place for a work's parts, or sees that it is; the file says which work's they are.
+
+    Raises:
+      InputError: there are parts of other work, or nothing can be written.
     """
     asked = dump_json(request)
-    if not path.exists():
-        write_text(path, asked)
-    elif path.read_text(encoding="utf-8") != asked:
+    try:
+        others = [one for one in path.parent.iterdir() if one != path] if path.parent.exists() else []
+        same = path.exists() and path.read_text(encoding="utf-8", errors="replace") == asked
+    except OSError as problem:
+        raise InputError("path", str(path), f"a place that can be written ({problem})") from problem
+    if others and not same:
         allowed = "a place without the parts of other work (other options, starts or versions); delete them first"
         raise InputError("path", str(path.parent), allowed)
+    if not same:
+        write_text(path, asked)
+
+
+def release(folder: Path) -> None:
+    """Removes a claimed folder. Whatever happens in between, no part of it is left where a claim could find it."""
+    away = folder.with_name(f".{folder.name}.{os.getpid()}-{secrets.token_hex(4)}")
+    folder.replace(away)
+    shutil.rmtree(away)
 
 
 def versions() -> dict[str, str]:

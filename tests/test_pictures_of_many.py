@@ -23,9 +23,13 @@ def test_basin_writes_maps_whose_shares_are_those_of_the_runs_beside_them_also_a
     cpjax.save(odd, cpjax.preset("placement"))
     arguments = ("--cells", 6, "--theta", -1, 1, "--controllers", odd, "corrected/lqr", "--duration", 3)
     arguments = ("basin", *arguments, "--x", -0.1, 0.1, "--out", tmp_path)
+    assert command(*arguments, "--dt", "nan").code == 2
+    assert not (tmp_path / "basin.parts").exists()  # nothing was saved: it may be asked for anything else
+    (tmp_path / "basin.json").write_text("of an earlier map")
     with monkeypatch.context() as patch:
         patch.setattr("cpjax.show.basin.basins", stop)
         assert command(*arguments).code == 130
+    assert (tmp_path / "basin.json").read_text() == "of an earlier map"
     refused = command(*arguments, "--seed", 2)
     assert refused.code == 2
     assert "without the parts of other work" in refused.err

@@ -110,6 +110,8 @@ def _run(arguments: list[str], set_up: bool) -> int:
         print(f"cpjax {options.command}: error: {problem}", file=sys.stderr)
         return 2
     except OSError as problem:  # a name too long, a disk that is full: what libraries have no better words for
+        if problem.filename is None:
+            raise
         said = InputError("path", problem.filename, f"a place that can be read and written ({problem.strerror})")
         print(f"cpjax {options.command}: error: {said}", file=sys.stderr)
         return 2

@@ -3,7 +3,6 @@
 import argparse
 import dataclasses
 import math
-import shutil
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -81,7 +80,7 @@ def run(given: argparse.Namespace) -> int:
     setting = {"duration": 10.0, "dt": 0.002, **sections["run"]}
     begin = time.perf_counter()
     chart = chart_of(chosen, given.seed)
-    rows = drawn(given.out, plant, controllers, chart, setting)
+    rows = drawn(given.out, given.out / "basin.parts", plant, controllers, chart, setting)
     seconds = time.perf_counter() - begin
     print_table(*table(rows), text_columns=1)
     steps = len(names) * chart.up.cells * chart.across.cells * round(setting["duration"] / setting["dt"])
@@ -91,10 +90,10 @@ def run(given: argparse.Namespace) -> int:
 
 
 def drawn(
-    out: Path, plant: CartPole, controllers: Mapping[str, Hybrid], chart: Map, setting: dict[str, Any]
+    out: Path, parts: Path, plant: CartPole, controllers: Mapping[str, Hybrid], chart: Map, setting: dict[str, Any]
 ) -> dict[str, dict[str, Any]]:
     """The maps of all controllers in a few numbers, with basin.json, basin.png and their runs written when all are
-    done. Until then the parts are in a folder of their own, and what an earlier map left stays as it is.
+    done. Until then everything is in the folder `parts`, and what an earlier map left in `out` stays as it is.
     """
     request = {
         "what": "share of a map from which controllers settle: sampled, not certified",
@@ -104,21 +103,20 @@ def drawn(
         "plant": io.encode(plant),
         "controllers": {name: io.encode(one) for name, one in controllers.items()},
     }
-    parts = out / "basin.parts"
-    io.claim(parts / "request.json", request)
-    metrics = {name: mapped(parts, plant, chart, name, one, setting) for name, one in controllers.items()}
-    rows = {name: document(chart, found) for name, found in metrics.items()}
-    files = {name: file_of(name) for name in controllers}
-    io.write_json(out / "basin.json", {**request, "basins": rows, "files": files})
+    with io.parts_of(parts, request):
+        metrics = {name: mapped(parts, plant, chart, name, one, setting) for name, one in controllers.items()}
+        rows = {name: document(chart, found) for name, found in metrics.items()}
 
-    from cpjax.show.basin import basins
-    from cpjax.show.figures import save_figure
+        from cpjax.show.basin import basins
+        from cpjax.show.figures import png
 
-    panels = [panel_of(plant, chart, name, one, metrics[name]) for name, one in controllers.items()]
-    save_figure(out / "basin.png", basins(chart, panels))
-    for file in files.values():
-        (parts / file).replace(out / file)
-    shutil.rmtree(parts)
+        panels = [panel_of(plant, chart, name, one, metrics[name]) for name, one in controllers.items()]
+        picture = png(basins(chart, panels))
+        files = {name: file_of(name) for name in controllers}
+        for file in files.values():
+            (parts / file).replace(out / file)
+        io.write_bytes(out / "basin.png", picture)
+        io.write_json(out / "basin.json", {**request, "basins": rows, "files": files})
     return rows
 
 

@@ -247,14 +247,14 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
     return Hybrid(swing_up, regulator, gate)
 
 
-def saved_controller(name: str) -> Controller:
-    """The preset of this name, or what the file of this name holds."""
+def saved_controller(name: str, also: str = "") -> Controller:
+    """The preset of this name, or what the file of this name holds; `also` is what else is allowed, in words."""
     for design, known in PRESETS.items():
         if name == known:
             return preset(design)
     if Path(name).suffix.lower() not in (".json", ".toml"):
         presets = ", ".join(PRESETS.values())
-        raise InputError("controller", name, f"{presets}, or the name of a file that ends in .json or .toml")
+        raise InputError("controller", name, f"{presets}, {also}or the name of a file that ends in .json or .toml")
     try:
         return as_controller(io.load(name))
     except InputError as problem:
@@ -271,11 +271,7 @@ def named_hybrid(name: str, plant: CartPole) -> Hybrid:
             if others in ([design], [design, gains]):  # "printed" comes first
                 return paper.controller(law, design, plant, gains)
         raise InputError("controller", name, f"{law}/lqr or {law}/placement, and after it /printed or /computed")
-    if name not in PRESETS.values() and Path(name).suffix.lower() not in (".json", ".toml"):
-        presets, laws = ", ".join(PRESETS.values()), ", ".join(paper.LAWS)
-        allowed = f"{presets}, a law ({laws}) with its regulator, such as corrected/lqr, or a file (.json or .toml)"
-        raise InputError("controller", name, allowed)
-    controller = saved_controller(name)
+    controller = saved_controller(name, f"a law ({', '.join(paper.LAWS)}) with its regulator, such as corrected/lqr, ")
     if not isinstance(controller, Hybrid):
         raise InputError("controller", name, "a Hybrid: a regulator behind a gate")
     return controller

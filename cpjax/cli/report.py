@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-import shutil
+from pathlib import Path
 from typing import Any
 
 from cpjax import __version__, io, paper
@@ -43,9 +43,18 @@ def run(given: argparse.Namespace) -> int:
         raise InputError("cells", chosen["cells"], f"0, or a whole number from 2 to {MOST_CELLS}")
     setting = Setting(seed=given.seed, **sections["evaluation"])
     per_axis, studies = chosen.get("cells", 256), chosen.get("studies", "quick")
-    parts = given.out / "report.parts"
     asked = {"setting": dataclasses.asdict(setting), "cells": per_axis, "studies": studies, "versions": io.versions()}
-    io.claim(parts / "request.json", asked)
+    with io.parts_of(given.out / "report.parts", asked) as parts:
+        rows = written(given, parts, setting, per_axis, studies)
+    print_rows(rows)
+    print(f"wrote {given.out / 'report.html'}")
+    return 0
+
+
+def written(
+    given: argparse.Namespace, parts: Path, setting: Setting, per_axis: int, studies: str
+) -> list[dict[str, Any]]:
+    """The page and all that stands beside it; the rows of the reproduction. What long studies save is in `parts`."""
     rows = rows_of(given, setting)
 
     from cpjax.cli import report_sections as sections_of  # matplotlib takes a while; bad input should not wait for it
@@ -92,26 +101,22 @@ def run(given: argparse.Namespace) -> int:
     sections_of.forensics(page, given)
     if studies != "none":
         sections_of.gradients(page, given, studies)
-        sections_of.tuning(page, given, studies)
+        sections_of.tuning(page, given, parts, studies)
     sections_of.comparison(page, given, results, shown_start)
     if studies != "none":
         sections_of.animation(page, given)
     if per_axis:
-        sections_of.basins(page, given, per_axis)
+        sections_of.basins(page, given, parts, per_axis)
     if studies != "none":
-        sections_of.fronts(page, given, studies)
+        sections_of.fronts(page, given, parts, studies)
     page.section("How to get this page again")
     page.text(
         f"`cpjax report --starts {setting.starts} --count {setting.count} --seed {setting.seed} "
         f"--duration {_shortest(setting.duration)} --dt {_shortest(setting.dt)} --cells {per_axis} "
         f"--studies {studies}` with cpjax {__version__}."
     )
-    path = given.out / "report.html"
-    page.write(path)
-    shutil.rmtree(parts)
-    print_rows(rows)
-    print(f"wrote {path}")
-    return 0
+    page.write(given.out / "report.html")
+    return rows
 
 
 def _shortest(seconds: float) -> str:

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, get_args
 
 from cpjax import io, paper
@@ -118,7 +119,7 @@ def gradients(page: Page, given: argparse.Namespace, size: str) -> None:
     page.note(gradients_text.TITLE + ". Every number stands in `audit_gradients.json`.")
 
 
-def tuning(page: Page, given: argparse.Namespace, size: str) -> None:
+def tuning(page: Page, given: argparse.Namespace, parts: Path, size: str) -> None:
     """A tuning of each design, from bland gains."""
     plant = paper.appendix_plant()
     page.section("Tuning by gradients")
@@ -131,7 +132,7 @@ def tuning(page: Page, given: argparse.Namespace, size: str) -> None:
         plan = Plan(seed=given.seed, **(QUICK_TUNING if size == "quick" else {}))
         free = free_parameters(beginning("bland", design, plant))
         folder = given.out / f"tune-{design}"
-        found = tuned(folder, plant, free, plan)
+        found = tuned(folder, plant, free, plan, parts / f"tune-{design}.npz")
         page.picture(
             (folder / "tune.png").read_bytes(),
             f"{DESIGN_NAMES[design]}: settling time and share of starts of each restart (grey), and of the one that is "
@@ -199,12 +200,14 @@ def animation(page: Page, given: argparse.Namespace) -> None:
     )
 
 
-def basins(page: Page, given: argparse.Namespace, cells: int) -> None:
+def basins(page: Page, given: argparse.Namespace, parts: Path, cells: int) -> None:
     """Where the paper's and the tuned controllers work."""
     plant = paper.appendix_plant()
     controllers = {name: named_hybrid(name, plant) for name in basin.CONTROLLERS}
     chart = basin.chart_of({"cells": cells}, given.seed)
-    _, header, rows = basin.table(basin.drawn(given.out, plant, controllers, chart, {"duration": 10.0, "dt": 0.002}))
+    _, header, rows = basin.table(
+        basin.drawn(given.out, parts / "basin", plant, controllers, chart, {"duration": 10.0, "dt": 0.002})
+    )
     page.section("Where they work")
     page.text(
         "One run of 10 s from every cell of a map of angle and rate, the cart at rest in the middle. This is the whole "
@@ -219,10 +222,12 @@ def basins(page: Page, given: argparse.Namespace, cells: int) -> None:
     page.note("Every number stands in `basin.json`, every run in the files that it names; `cpjax basin` draws others.")
 
 
-def fronts(page: Page, given: argparse.Namespace, size: str) -> None:
+def fronts(page: Page, given: argparse.Namespace, parts: Path, size: str) -> None:
     """What settling faster costs."""
     plan = FrontPlan(seed=given.seed, **(QUICK_FRONTS if size == "quick" else {}))
-    found = pareto.made(given.out, paper.appendix_plant(), plan, () if size == "quick" else pareto.SUPPLIES)
+    found = pareto.made(
+        given.out, parts / "pareto", paper.appendix_plant(), plan, () if size == "quick" else pareto.SUPPLIES
+    )
     page.section("At what price")
     if size == "quick":
         page.text(

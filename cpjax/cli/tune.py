@@ -92,7 +92,7 @@ def run(given: argparse.Namespace) -> int:
     names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}
     free = free_parameters(controller, **names, full_q=setting.pop("full_q", "diagonal") == "full")
     plan = Plan(seed=given.seed, goal=Goal(**sections["goal"]), **setting)
-    tuning = tuned(given.out, plant, free, plan)
+    tuning = tuned(given.out, plant, free, plan, given.out / "checkpoint.npz")
     before = np.asarray(free.physical(free.start()))
     rows = [(label, f"{a:.4g}", f"{b:.4g}") for label, a, b in zip(tuning.labels, before, tuning.physical, strict=True)]
     print_table("Parameters, SI units", ("parameter", "start", "tuned"), rows, text_columns=1)
@@ -105,12 +105,11 @@ def run(given: argparse.Namespace) -> int:
     return 0 if tuning.success_rate > 0.0 else 1
 
 
-def tuned(out: Path, plant: CartPole, free: FreeParameters, plan: Plan) -> "Tuning":
+def tuned(out: Path, plant: CartPole, free: FreeParameters, plan: Plan, checkpoint: Path) -> "Tuning":
     """The tuning, with tuned.json, tune.json and tune.png written."""
     from cpjax.tune.outcome import document
     from cpjax.tune.tuner import tune  # optax takes a while; other commands should not wait for it
 
-    checkpoint = out / "checkpoint.npz"
     with progress("tune") as report:
         tuning = tune(plant, free, plan, progress=report, checkpoint=checkpoint)
     io.save(out / "tuned.json", tuning.controller)

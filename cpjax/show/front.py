@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
+from matplotlib.ticker import AutoLocator, NullLocator, StrMethodFormatter
 
 from cpjax.errors import InputError
 from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES
@@ -97,10 +97,20 @@ def _view(shown: np.ndarray[Any, Any]) -> tuple[np.ndarray[Any, Any], np.ndarray
     return np.array([np.exp(low[0]), low[1]]), np.array([np.exp(high[0]), high[1]])
 
 
+class _Times(AutoLocator):
+    """Seconds that a logarithmic axis is marked at."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
+        """Round ones; of a short stretch, which may hold none of them, a linear axis's."""
+        steps = np.outer(10.0 ** np.arange(-2, 4), [1, 1.5, 2, 2.5, 3, 4, 5, 6, 8]).ravel()
+        inside = steps[(steps >= vmin) & (steps <= vmax)]
+        return inside.tolist() if len(inside) > 2 else super().tick_values(vmin, vmax)
+
+
 def _time_axis(axes: Axes) -> None:
     """Logarithmic: the bend of a front is at its fast end."""
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(FixedLocator([1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 15, 20]))
+    axes.xaxis.set_major_locator(_Times())
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.set_xlabel("mean settling time [s]")
@@ -148,7 +158,7 @@ def findings(curves: Mapping[tuple[float, str], Mapping[str, Curve]]) -> list[st
 def _found(curve: Curve) -> str:
     """What either search finds of one design."""
     if not len(curve.traced):
-        other = f"random search {len(curve.random)} points" if len(curve.random) else "neither does random search"
+        other = "random search has some" if len(curve.random) else "neither does random search"
         return f"has no point by gradients, {other}"
     words = f"settles after {curve.traced[0, 0]:.2f} s at the fastest"
     if not curve.traced_volume:
@@ -173,6 +183,7 @@ def _verdict(designs: Mapping[str, Curve]) -> str:
         if curve.traced_volume:
             share = f"{100 * (curve.random_volume / curve.traced_volume - 1.0):+.0f} %"
         else:
-            share = "some, of gradients none" if curve.random_volume else "none"
+            none = "beyond the reference" if len(curve.traced) else "none"
+            share = f"some, of gradients {none}" if len(curve.random) else none
         parts.append(f"{DESIGN_NAMES[design]} {share}")
     return "hypervolume of random search:\n" + ", ".join(parts)

@@ -22,6 +22,12 @@ _SIGMAS = 1.959963984540054  # of a normal distribution, that hold 95 %
 _FINITE = Number("SI unit", "")
 
 
+def _finite(name: str, value: Any) -> float:
+    if np.ndim(value):
+        raise InputError(name, value, "one finite number")
+    return float(_FINITE.normalise(name, value))
+
+
 @dataclasses.dataclass(frozen=True)
 class Axis:
     """One coordinate of the start, in `cells` equal cells from `low` to `high`."""
@@ -35,7 +41,7 @@ class Axis:
         if self.name not in NAMES:
             raise InputError("Axis.name", self.name, "one of " + ", ".join(NAMES))
         for name in ("low", "high"):
-            object.__setattr__(self, name, _FINITE.normalise(f"Axis.{name}", getattr(self, name)))
+            object.__setattr__(self, name, _finite(f"Axis.{name}", getattr(self, name)))
         if not self.low < self.high:
             raise InputError("Axis.high", self.high, f"above low, {self.low}")
         if isinstance(self.cells, bool) or not isinstance(self.cells, int) or not 2 <= self.cells <= MOST_CELLS:
@@ -77,7 +83,7 @@ class Map:
                 raise InputError("Map.others", name, "one of " + ", ".join(free))
             if not isinstance(ends, (tuple, list)) or len(ends) != 2:
                 raise InputError(f"Map.others[{name}]", ends, "two finite numbers, the lower one first")
-            low, high = (_FINITE.normalise(f"Map.others[{name}]", end) for end in ends)
+            low, high = (_finite(f"Map.others[{name}]", end) for end in ends)
             if low > high:
                 raise InputError(f"Map.others[{name}]", ends, "two finite numbers, the lower one first")
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:

@@ -15,6 +15,7 @@ continuous clock and failures included; a bound is kept by the mean over the suc
 import dataclasses
 import functools
 import math
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -76,11 +77,13 @@ class Fronts:
       random: by random search, likewise.
       steps: for each supply the Runge-Kutta steps of values and of gradients that the tracing took, and of the random
         search.
+      seconds: that everything took, also what an interrupted call did before.
     """
 
     traced: dict[Lane, Front]
     random: dict[Lane, Front]
     steps: dict[float, dict[str, int]]
+    seconds: float
 
 
 def trace_fronts(
@@ -111,15 +114,18 @@ def trace_fronts(
     judge = Judge(plant, design, plan)
 
     def trace() -> Search:
+        begin = time.perf_counter()
         judge.steps = Counter()
         report(0, parts, "screening candidates")
         begun = {supply: judge.begin(supply, plan.candidates, 0) for supply in everywhere}
         tracer = Tracer(judge, plan)
         met = tracer.trace(begun, wanted, lambda done, text: report(done, parts, text))
-        return Search(met, {supply: len(one.vectors) for supply, one in begun.items()}, judge.steps, tracer.steps)
+        counts = {supply: len(one.vectors) for supply, one in begun.items()}
+        return Search(met, counts, judge.steps, tracer.steps, time.perf_counter() - begin)
 
     def draw() -> Search:
         # For each supply as much work; as many as the tracing's are judged a second time, the rest goes into screening.
+        begin = time.perf_counter()
         judge.steps = Counter()
         drawn = {}
         run = round(plan.horizon / plan.judging_dt)
@@ -129,7 +135,7 @@ def trace_fronts(
             budget -= run * plan.judging * traced.begun[supply]
             drawn[supply] = judge.begin(supply, max(1, int(budget / (run * plan.screening))), 1)
         counts = {supply: len(one.vectors) for supply, one in drawn.items()}
-        return Search(drawn, counts, judge.steps, dict.fromkeys(everywhere, 0))
+        return Search(drawn, counts, judge.steps, dict.fromkeys(everywhere, 0), time.perf_counter() - begin)
 
     traced = remembered(memory and memory / "traced.npz", trace)
     random = remembered(memory and memory / "random.npz", draw)
@@ -142,6 +148,7 @@ def trace_fronts(
         for supply in everywhere
     }
 
+    begin = time.perf_counter()
     fronts: list[dict[Lane, Front]] = []
     for which, found in enumerate((traced.met, random.met)):
         fronts.append({})
@@ -149,7 +156,7 @@ def trace_fronts(
             report(parts - (2 - which) * len(wanted) + number, parts, "measuring the points")
             fronts[-1][lane] = _front(judge, plan, found[lane[0]], *lane, reference[lane])
     report(parts, parts, "done")
-    return Fronts(fronts[0], fronts[1], steps)
+    return Fronts(fronts[0], fronts[1], steps, traced.seconds + random.seconds + time.perf_counter() - begin)
 
 
 def _front(judge: Judge, plan: FrontPlan, met: Judged, supply: float, cost: str, reference: Numbers) -> Front:

@@ -24,6 +24,8 @@ class Search(NamedTuple):
     """Runge-Kutta steps of values."""
     gradients: Mapping[float, int]
     """And of gradients."""
+    seconds: float
+    """Not by supply: what the search took."""
 
 
 def remembered(path: Path | None, search: Callable[[], Search]) -> Search:
@@ -33,14 +35,15 @@ def remembered(path: Path | None, search: Callable[[], Search]) -> Search:
             columns = dict(archive)
         supplies = columns["supplies"].tolist()
         met = {supply: Judged(*(columns[f"{i}.{n}"] for n in Judged._fields)) for i, supply in enumerate(supplies)}
-        return Search(met, *(dict(zip(supplies, columns[name].tolist(), strict=True)) for name in _COUNTS))
+        begun, values, gradients = (dict(zip(supplies, columns[name].tolist(), strict=True)) for name in _COUNTS)
+        return Search(met, begun, values, gradients, float(columns["seconds"]))
     found = search()
     if path is not None:
         columns = {
             f"{i}.{name}": of[name] for i, one in enumerate(found.met.values()) for of in [one._asdict()] for name in of
         }
         counts = {name: np.array([getattr(found, name)[supply] for supply in found.met]) for name in _COUNTS}
-        content: dict[str, Any] = {"supplies": np.array([*found.met]), **counts, **columns}
+        content: dict[str, Any] = {"supplies": np.array([*found.met]), "seconds": found.seconds, **counts, **columns}
         buffer = buffers.BytesIO()
         np.savez(buffer, **content)
         io.write_bytes(path, buffer.getvalue())

@@ -3,7 +3,6 @@
 import hashlib
 import io as buffers
 import json
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -190,5 +189,5 @@ def _assemble(path: Path, folder: Path, parts: list[Path], document: dict[str, A
         buffer = buffers.BytesIO()
         arrow.parquet.write_table(table, buffer)
         io.write_bytes(path, buffer.getvalue())
-    shutil.rmtree(folder)
+    io.release(folder)
     return jax.tree.unflatten(work.structure(), list(results.values()))

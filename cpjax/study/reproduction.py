@@ -107,7 +107,7 @@ def representative(law: str, plant: str, setting: Setting) -> tuple[str, State]:
     times = np.max([np.where(one.success, np.asarray(one.settling_time), np.inf) for one in both], axis=0)
     successes = int(np.isfinite(times).sum())
     index = int(np.argsort(times)[(successes - 1) // 2]) if successes else 0
-    words = "the median of those that both catch," if successes else "the first, for both catch none,"
+    words = "the median of those that both catch," if successes else "the first, for none is caught by both,"
     start: State = jax.tree.map(lambda column: float(column[index]), starts)
     return f"{words} of {setting.count} {setting.starts} starts (number {index + 1})", start
 

@@ -73,6 +73,7 @@ def test_a_cells_outcome_is_that_of_a_rollout_from_its_start():
         (lambda: Axis("x", 1.0, 1.0), "Axis.high"),
         (lambda: Axis("x", math.nan, 1.0), "Axis.low"),
         (lambda: Axis("x", None, 1.0), "Axis.low"),
+        (lambda: Axis("x", np.array([0.0, 0.5]), 1.0), "Axis.low"),
         (lambda: Axis("x", 0.0, 1.0, 1), "Axis.cells"),
         (lambda: Map(ANGLE, RATE, {"x": 0.0}), r"Map.others\[x\]"),
         (lambda: Map(ANGLE, RATE, {"x": (0.0, "1")}), r"Map.others\[x\]"),
