@@ -51,7 +51,7 @@ def no_pictures(monkeypatch):
     """Drawing is slow and is not what the test is about."""
     monkeypatch.setattr(cpjax.show.figures, "response", lambda *_: None)
     monkeypatch.setattr(cpjax.show.figures, "success_rates", lambda *_: None)
-    monkeypatch.setattr(cpjax.show.figures, "save_figure", lambda path, _: io.write_bytes(path, PNG))
+    monkeypatch.setattr(cpjax.show.figures, "save_figure", lambda path, _: io.write_bytes(path, PNG) or PNG)
     monkeypatch.setattr(cpjax.show.figures, "png", lambda _: PNG)
     monkeypatch.setattr(cpjax.show.reproduction, "pictures", lambda _: [("one", None, "A caption.")])
 
