@@ -1,9 +1,12 @@
 """The hybrid law: a swing-up law outside a gate, a regulator inside it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.gates import Gate
 from cpjax.controllers.protocol import REGULATE, SWING_UP, Law
 from cpjax.pytree import Scalar, part, pytree
@@ -42,3 +45,11 @@ class Hybrid:
     def successor(self, mode: jax.Array) -> jax.Array:
         """The other one."""
         return (SWING_UP + REGULATE) - mode
+
+
+def without_design(controller: Hybrid) -> Hybrid:
+    """The same loop without what its gain was designed from: hybrids of all designs are then one program to compile."""
+    regulator = controller.regulator
+    if isinstance(regulator, StateFeedback):
+        regulator = dataclasses.replace(regulator, design=None)
+    return dataclasses.replace(controller, regulator=regulator)

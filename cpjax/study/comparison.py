@@ -8,6 +8,7 @@ import numpy as np
 
 from cpjax import io, paper
 from cpjax.controllers import Hybrid
+from cpjax.controllers.hybrid import without_design
 from cpjax.plant import CartPole
 from cpjax.presets import preset
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
@@ -77,7 +78,7 @@ def compare(
             progress(i, len(chosen), f"{entry.name}, {entry.design}, {entry.gains}")
         metrics: Metrics = sweep(
             plant,
-            entry.controller,
+            without_design(entry.controller),
             starts,
             duration=setting.duration,
             dt=setting.dt,

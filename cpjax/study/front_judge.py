@@ -12,6 +12,7 @@ import numpy as np
 
 from cpjax import paper
 from cpjax.controllers import EnergySwingUp
+from cpjax.controllers.hybrid import without_design
 from cpjax.numeric.pareto import nondominated
 from cpjax.plant import CartPole
 from cpjax.sim.metrics import Metrics
@@ -88,7 +89,7 @@ class Judge:
         self._plant, self._design, self._plan = plant, design, plan
         self.free = free_parameters(beginning("bland", design, plant))
         self.steps: Counter[float] = Counter()
-        self._built = jax.jit(jax.vmap(lambda vector, supply: self.free_at(supply).build(vector)))
+        self._built = jax.jit(jax.vmap(lambda vector, supply: without_design(self.free_at(supply).build(vector))))
 
     def plant_at(self, supply: Any) -> CartPole:
         """The plant at a supply [V]."""

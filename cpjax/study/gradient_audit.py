@@ -7,6 +7,7 @@ sensitivity that grows with time.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
@@ -202,7 +203,7 @@ def audit_gradients(
             raise InputError("build", controller, "one that makes a cpjax.Hybrid")
         return plant, controller
 
-    def probe(vector: jax.Array, start: State, switching: Any, temperature: float | None) -> tuple[Probe, jax.Array]:
+    def probe(vector: jax.Array, start: State, switching: Any, temperature: Any) -> tuple[Probe, jax.Array]:
         plant, controller = made(vector)
         law: Any = controller
         if temperature is not None:
@@ -215,18 +216,13 @@ def audit_gradients(
         )
         return found
 
-    def jacobians(switching: Any, temperature: float | None = None, *, arguments: tuple[int, ...] = (0,)) -> Any:
-        def of_all(vector: jax.Array, start: jax.Array) -> tuple[Any, Any]:
+    def jacobians(switching: Any, arguments: tuple[int, ...]) -> Any:
+        def of_all(vector: jax.Array, start: jax.Array, temperature: Any) -> tuple[Any, Any]:
             found, flag = probe(vector, State.from_vector(start), switching, temperature)
             return (found.value, found.state), (found, flag)
 
-        return jax.jit(jax.vmap(jax.jacfwd(of_all, argnums=arguments, has_aux=True)))(
-            jnp.asarray(x, dtype), starts.vector()
-        )
-
-    def slopes(switching: Any, temperature: float | None = None) -> Numbers:
-        (value, _), _ = jacobians(switching, temperature)
-        return np.asarray(value[0]) * scale[:, None]
+        compiled = jax.jit(jax.vmap(jax.jacfwd(of_all, argnums=arguments, has_aux=True), in_axes=(0, 0, None)))
+        return functools.partial(compiled, jnp.asarray(x, dtype), starts.vector())
 
     parts = 2 + len(temperatures) + len(_STEPS)
     done = 0
@@ -238,14 +234,16 @@ def audit_gradients(
         done += 1
 
     report("located switching")
-    (value, state), (found, flag) = jacobians("located", arguments=(0, 1))
+    (value, state), (found, flag) = jacobians("located", (0, 1))(None)
     located = np.asarray(value[0]) * scale[:, None]
     report("switching per step")
-    plain = slopes("per_step")
+    per_step = jacobians("per_step", (0,))  # one program for all temperatures, and one without
+    (rough, _), _ = per_step(None)
     smooth = []
     for temperature in temperatures:
         report(f"smooth, temperature {temperature:g}")
-        smooth.append(slopes("per_step", float(temperature)))
+        (slope, _), _ = per_step(float(temperature))
+        smooth.append(np.asarray(slope[0]) * scale[:, None])
     difference = _differences(probe, x, starts, scale, found, report)
     report("done")
     return GradientAudit(
@@ -254,7 +252,7 @@ def audit_gradients(
         temperatures=tuple(map(float, temperatures)),
         value=np.asarray(found.value),
         located=located,
-        plain=plain,
+        plain=np.asarray(rough[0]) * scale[:, None],
         smooth=tuple(smooth),
         difference=difference.derivative,
         uncertainty=difference.uncertainty,

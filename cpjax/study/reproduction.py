@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from cpjax import io, paper
+from cpjax.controllers.hybrid import without_design
 from cpjax.errors import InputError
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.rollout import Trajectory, rollout
@@ -63,7 +64,9 @@ def evaluate(variant: Variant, setting: Setting, starts: State | None = None) ->
     controller = paper.controller(variant.law, variant.design, plant, variant.gains)
     if starts is None:
         starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
-    metrics: Metrics = sweep(plant, controller, starts, duration=setting.duration, dt=setting.dt, clock="sampled")
+    metrics: Metrics = sweep(
+        plant, without_design(controller), starts, duration=setting.duration, dt=setting.dt, clock="sampled"
+    )
     return metrics
 
 
