@@ -61,7 +61,7 @@ def variants() -> list[Variant]:
 def evaluate(variant: Variant, setting: Setting, starts: State | None = None) -> Metrics:
     """Metrics of one variant over the setting's starts."""
     plant = paper.PLANTS[variant.plant]()
-    controller = paper.controller(variant.law, variant.design, plant, variant.gains)
+    controller = without_design(paper.controller(variant.law, variant.design, plant, variant.gains))
     if starts is None:
         starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
     metrics: Metrics = sweep(
