@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from cpjax import paper
 from cpjax.numeric.pareto import hypervolume, nondominated
@@ -204,6 +204,7 @@ class Tracer:
         self.steps_of_a_run = round(plan.duration / plan.dt) + self._spare
         mesh = Mesh(np.array(jax.devices()), ("tunings",))
         shared_out: Any = PartitionSpec("tunings")  # type: ignore[no-untyped-call]  # untyped in JAX
+        self._placed = functools.partial(jax.device_put, device=NamedSharding(mesh, shared_out))
         same: Any = PartitionSpec()  # type: ignore[no-untyped-call]  # untyped in JAX
         each = jax.vmap(self._slope, in_axes=(0, 0, None))
         specs = {"in_specs": (shared_out, shared_out, same), "out_specs": shared_out}
@@ -222,7 +223,7 @@ class Tracer:
             bounds[row, COSTS.index(cost)] = bound
         supplies = np.array([supply for supply, _, _ in jobs])
         first = [begun[job[0]].fastest(*job[1:], plan.success, row % plan.variety)[0] for row, job in enumerate(jobs)]
-        vectors = jnp.asarray(np.stack(first))
+        vectors = self._placed(np.stack(first))  # as each step leaves them: otherwise the gradient is compiled twice
         prices = np.where(np.isfinite(bounds), plan.price, 0.0)  # of a bound's worth of each cost
         state = self._optimiser.init(vectors)
         met = dict(begun)
