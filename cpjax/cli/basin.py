@@ -205,7 +205,7 @@ def table(rows: Mapping[str, dict[str, Any]]) -> tuple[str, tuple[str, ...], lis
     )
     cells = [
         (
-            name,
+            controller_title(name),
             f"{100 * row['share']:.2f}",
             f"{row['area']:.3f}",
             f"{row['area_half_width']:.3f}",

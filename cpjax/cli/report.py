@@ -14,7 +14,7 @@ from cpjax.study.reproduction import Setting
 
 OPTIONS = [
     *EVALUATION_OPTIONS,
-    Option("report", "cells", "of the basins, along each axis; 0 for none (default 256)", int),
+    Option("report", "cells", "of the basins, along each axis; 0 for none (default 192)", int),
     Option(
         "report",
         "studies",
@@ -39,10 +39,10 @@ def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
     chosen = sections["report"]
-    if not 0 <= chosen.get("cells", 256) <= MOST_CELLS or chosen.get("cells") == 1:
+    if not 0 <= chosen.get("cells", 192) <= MOST_CELLS or chosen.get("cells") == 1:
         raise InputError("cells", chosen["cells"], f"0, or a whole number from 2 to {MOST_CELLS}")
     setting = Setting(seed=given.seed, **sections["evaluation"])
-    per_axis, studies = chosen.get("cells", 256), chosen.get("studies", "quick")
+    per_axis, studies = chosen.get("cells", 192), chosen.get("studies", "quick")
     asked = {"setting": dataclasses.asdict(setting), "cells": per_axis, "studies": studies, "versions": io.versions()}
     with io.parts_of(given.out / "report.parts", asked) as parts:
         rows = written(given, parts, setting, per_axis, studies)

@@ -34,9 +34,9 @@ from cpjax.tune.starting import beginning
 
 QUICK_FRONTS: Mapping[str, Any] = {
     "bounds": 11,
-    "candidates": 1024,
-    "steps": 24,
-    "judge_every": 6,
+    "candidates": 2048,
+    "steps": 40,
+    "judge_every": 4,
     "semifinal": 128,
     "final": 256,
 }

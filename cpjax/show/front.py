@@ -58,10 +58,10 @@ def fronts(
                 axes.plot(
                     *point, "*", color=DESIGN_COLOURS[design], markersize=11, label=f"{DESIGN_NAMES[design]}, bland"
                 )
-        # The view is that of fronts and bland starts; a controller beyond it stands at its edge.
-        shown = np.concatenate(
-            [*(np.concatenate([c.traced, c.random]) for c in designs.values()), [*bland[cost].values()]]
-        )
+        # The view is that of fronts, bland starts and what nearly always settles; what is beyond stands at its edge.
+        good = [(one.time, one.cost) for one in known[cost] if one.success > 0.9]
+        found = [np.concatenate([curve.traced, curve.random]) for curve in designs.values()]
+        shown = np.concatenate([*found, np.reshape([*bland[cost].values(), *good], (-1, 2))])
         low, high = _view(shown)
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])

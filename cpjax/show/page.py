@@ -13,7 +13,7 @@ _STYLE = """
   :root { --ink: #e6e9ec; --paper: #14171a; --soft: #9aa4ae; --line: #333a41; --band: #1d2226; }
 }
 * { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 68rem; padding: 1.5rem 1rem 4rem; background: var(--paper); color: var(--ink);
+body { margin: 0 auto; max-width: 72rem; padding: 1.5rem 1rem 4rem; background: var(--paper); color: var(--ink);
   font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
 h1 { line-height: 1.2; font-size: 1.9rem; margin: 0.5rem 0; } h2 { margin-top: 2.6rem; font-size: 1.35rem; }
 p.lead { font-size: 1.1rem; color: var(--soft); } figure { margin: 1.5rem 0; }
@@ -21,8 +21,8 @@ figure img { display: block; width: 100%; height: auto; background: #fff; }
 @media screen and (max-width: 44rem) { figure img { width: 44rem; } }
 figcaption, .note { color: var(--soft); font-size: 0.93rem; margin-top: 0.4rem; }
 .scroll { overflow-x: auto; border: 1px solid var(--line); border-radius: 6px; }
-table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.35rem 0.6rem; text-align: right; white-space: nowrap; }
+table { border-collapse: collapse; width: 100%; font-size: 0.86rem; font-variant-numeric: tabular-nums; }
+th, td { padding: 0.35rem 0.45rem; text-align: right; white-space: nowrap; }
 th { background: var(--band); font-weight: 600; vertical-align: bottom; white-space: normal; }
 th.text, td.text { text-align: left; } tbody tr + tr td { border-top: 1px solid var(--line); }
 code { font-size: 0.92em; background: var(--band); padding: 0.05em 0.3em; border-radius: 4px; }
