@@ -34,6 +34,7 @@ from cpjax import (
 )
 from cpjax.cli import main, report_sections
 from cpjax.cli.basin import CONTROLLERS, file_of
+from cpjax.cli.options import controller_title
 from cpjax.cli.reproduce import print_rows
 from cpjax.cli.swingup import OPTIONS
 from cpjax.study import reproduction
@@ -874,9 +875,10 @@ def test_the_studies_in_a_report_are_those_of_its_json(command, tmp_path, monkey
     expected = ["pole placement", f"{100 * found['success_rate']:.2f}", f"{found['settling_time']:.3f}"]
     assert expected in [cells[:3] for cells in page.rows]
     basins = document(tmp_path, "basin.json")["basins"]
-    shown = [cells for cells in page.rows if cells and cells[0] in CONTROLLERS]
-    assert [cells[0] for cells in shown] == list(CONTROLLERS)
-    assert [cells[1] for cells in shown] == [f"{100 * basins[cells[0]]['share']:.2f}" for cells in shown]
+    titles = [controller_title(name) for name in CONTROLLERS]
+    shown = [cells for cells in page.rows if cells and cells[0] in titles]
+    assert [cells[0] for cells in shown] == titles
+    assert [cells[1] for cells in shown] == [f"{100 * basins[name]['share']:.2f}" for name in CONTROLLERS]
     assert all((tmp_path / file_of(name)).exists() for name in CONTROLLERS)
     fronts = document(tmp_path, "pareto.json")["fronts"]["lqr"]["rows"]
     rows = [cells for cells in page.rows if cells and cells[0] == "lqr" and cells[1] == "cart_travel"]
