@@ -89,6 +89,11 @@ def test_layers_begin_with_what_no_other_beats_and_end_with_what_is_finite():
         ({"lowest": 1.0}, "lowest"),
         ({"success": 1.5}, "success"),
         ({"dearest": 0.5}, "dearest"),
+        ({"lowest": 0.9995}, "lowest"),
+        ({"exchange_from": 0.0}, "exchange_from"),
+        ({"spare_rate": 0.0}, "spare_rate"),
+        ({"clip": math.inf}, "clip"),
+        ({"explore": -0.1}, "explore"),
     ],
 )
 def test_a_bad_plan_is_refused(change, field):
