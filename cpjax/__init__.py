@@ -20,13 +20,16 @@ from cpjax.controllers import (
     SmoothClip,
     SmoothHybrid,
     StateFeedback,
+    VoltageSignal,
+    as_sampled,
 )
 from cpjax.design.discretization import discretize, discretize_cost
 from cpjax.design.lqr import dlqr, lqr
 from cpjax.design.placement import QuadraticFactors, place, place_polynomial
 from cpjax.design.riccati import care, dare
-from cpjax.errors import InputError
+from cpjax.errors import DerivativeWarning, InputError, PerformanceWarning
 from cpjax.io import load, save
+from cpjax.numeric.quantisation import quantize
 from cpjax.plant import CartPole, LinearModel, Motor, linearize
 from cpjax.presets import preset
 from cpjax.runtime import configure_cpu
@@ -34,6 +37,7 @@ from cpjax.sim.flags import Flag
 from cpjax.sim.gradients import Gradients, gradients
 from cpjax.sim.metrics import Metrics, ProtocolMetrics, TimeOutside
 from cpjax.sim.rollout import Trajectory, measure, rollout
+from cpjax.sim.settings import Simulation
 from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
 from cpjax.state import HANGING, UPRIGHT, State
@@ -52,6 +56,7 @@ __all__ = [
     "AngleGate",
     "AngleRateGate",
     "CartPole",
+    "DerivativeWarning",
     "EnergySwingUp",
     "Flag",
     "Gradients",
@@ -62,16 +67,20 @@ __all__ = [
     "LyapunovGate",
     "Metrics",
     "Motor",
+    "PerformanceWarning",
     "PoleFactors",
     "ProtocolMetrics",
     "QuadraticFactors",
+    "Simulation",
     "SmoothClip",
     "SmoothHybrid",
     "State",
     "StateFeedback",
     "TimeOutside",
     "Trajectory",
+    "VoltageSignal",
     "__version__",
+    "as_sampled",
     "care",
     "configure_cpu",
     "dare",
@@ -87,6 +96,7 @@ __all__ = [
     "place",
     "place_polynomial",
     "preset",
+    "quantize",
     "read_sweep",
     "record_sweep",
     "rollout",

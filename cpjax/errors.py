@@ -22,3 +22,11 @@ class InputError(ValueError):
 def _short(value: Any) -> str:
     text = " ".join(repr(value).split())
     return text if len(text) <= 120 else text[:117] + "..."
+
+
+class DerivativeWarning(UserWarning):
+    """A derivative was asked for that leaves something out; the message says what, and how to ask for it."""
+
+
+class PerformanceWarning(UserWarning):
+    """Something runs much slower than it could; the message says why."""

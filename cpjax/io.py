@@ -110,6 +110,8 @@ def encode(thing: Any) -> dict[str, Any]:
     if TYPES.get(name) is not type(thing):
         raise InputError("thing", thing, "one of " + ", ".join(TYPES))
     fields = {f.name: getattr(thing, f.name) for f in dataclasses.fields(TYPES[name])}
+    if isinstance(thing, Trajectory):  # what the plant keeps stands beside the rest
+        fields |= fields.pop("outputs")
     given = {key: value for key, value in fields.items() if value is not None}
     return {"type": name, **{key: _encode_value(f"{name}.{key}", value) for key, value in given.items()}}
 
@@ -262,6 +264,8 @@ def _decode(table: dict[str, Any], path: str) -> Any:
         raise InputError(f"{path}: type", tag, "one of " + ", ".join(TYPES))
     cls = TYPES[tag]
     fields = {f.name: f for f in dataclasses.fields(cls)}
+    if cls is Trajectory:
+        table["outputs"] = {key: table.pop(key) for key in list(table) if key not in fields}
     for key in table:
         if key not in fields:
             raise InputError(f"{path}: key", key, f"one of {tag}'s fields: " + ", ".join(fields))
@@ -269,7 +273,9 @@ def _decode(table: dict[str, Any], path: str) -> Any:
     for name, field in fields.items():
         if name not in table and (field.default, field.default_factory) == optional:
             raise InputError(f"{path}: key", name, f"present: {tag} has no default for it")
-    values = {key: _decode_value(value, f"{path}: {key}") for key, value in table.items()}
+    values = {key: _decode_value(value, f"{path}: {key}") for key, value in table.items() if key != "outputs"}
+    if cls is Trajectory:
+        values["outputs"] = {key: _decode_value(value, f"{path}: {key}") for key, value in table["outputs"].items()}
     try:
         return cls(**values)
     except InputError as problem:

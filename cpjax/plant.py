@@ -13,7 +13,7 @@ gives (paper, section III, with its sign error mended; see docs/paper.md)
 `CartPole.acceleration` is the only place that solves these for x'' and th''.
 """
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -21,9 +21,13 @@ import numpy as np
 
 from cpjax.errors import InputError
 from cpjax.numeric.extremes import larger, smaller
-from cpjax.numeric.trigonometry import sin_cos
+from cpjax.numeric.trigonometry import LARGEST_TURN, sin_cos, turned
 from cpjax.pytree import Number, Scalar, check, is_traced, number, part, pytree
-from cpjax.state import HANGING, UPRIGHT, State
+from cpjax.returned import call, real
+from cpjax.state import ANGLE_LIMIT, HANGING, NAMES, RUNAWAY_LIMIT, UNITS, UPRIGHT, State
+
+Pair: TypeAlias = tuple[Scalar, Scalar]
+"""One number for the cart, one for the pole."""
 
 
 @pytree
@@ -116,6 +120,57 @@ class CartPole:
         mass = Number("kg", "mass of the rod", above=0.0).normalise("CartPole.rod: mass", mass)
         length = Number("m", "length of the rod", above=0.0).normalise("CartPole.rod: length", length)
         return cls(pole_mass=mass, pole_length=length / 2, pole_inertia=mass * length * length / 12, **others)
+
+    @property
+    def limits(self) -> State:
+        """The largest magnitude of each component of the state; a rollout that goes beyond is stopped."""
+        return State(RUNAWAY_LIMIT, RUNAWAY_LIMIT, ANGLE_LIMIT, RUNAWAY_LIMIT)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the state's components, by name, for error messages."""
+        return dict(zip(NAMES, UNITS, strict=True))
+
+    @property
+    def input_limit(self) -> Scalar:
+        """The voltage at which the drive clips [V]."""
+        return self.motor.voltage_limit
+
+    def coordinates(self, state: State) -> tuple[Pair, Pair]:
+        """Returns positions (x, theta) and velocities (x', theta')."""
+        return (state.x, state.theta), (state.x_dot, state.theta_dot)
+
+    def state(self, q: Pair, v: Pair) -> State:
+        """Returns the state of positions (x, theta) and velocities (x', theta')."""
+        return State(q[0], v[0], q[1], v[1])
+
+    def saturate(self, command: Scalar) -> Scalar:
+        """Returns the terminal voltage [V] that the drive makes of a command: see `Motor.saturate`."""
+        return real("plant.motor.saturate", call("plant.motor", self.motor, "saturate", command))
+
+    def geometry(self, q: Pair) -> Pair:
+        """Returns sine and cosine of theta: all that the accelerations need of the positions."""
+        return sin_cos(q[1])
+
+    def geometry_near(self, geometry: Pair, change: Pair) -> tuple[Pair, jax.Array]:
+        """Returns sine and cosine after a `change` of the positions, and whether that is accurate to rounding."""
+        turn = jnp.asarray(change[1])
+        accurate = jnp.abs(turn) <= LARGEST_TURN
+        return turned(jnp.asarray(geometry[0]), jnp.asarray(geometry[1]), turn), accurate
+
+    def accelerations(self, geometry: Pair, v: Pair, u: Scalar) -> Pair:
+        """Returns (x'', theta'') [m/s^2, rad/s^2] under the applied voltage `u` [V].
+
+        Args:
+          geometry: sine and cosine of theta.
+          v: (x', theta') [m/s, rad/s].
+        """
+        force = real("plant.motor.force", call("plant.motor", self.motor, "force", u, v[0]))
+        return self.acceleration(*geometry, v, force)
+
+    def outputs(self, state: State, acceleration: Pair, u: Scalar) -> dict[str, Scalar]:
+        """Returns what a trajectory keeps beside state and voltage: x'' as `cart_acceleration` [m/s^2]."""
+        return {"cart_acceleration": acceleration[0]}
 
     @property
     def moving_mass(self) -> Scalar:

@@ -79,25 +79,29 @@ class Number:
 
 @dataclasses.dataclass(frozen=True)
 class Matrix:
-    """Declaration of an array-valued field: its last axes have `shape`; axes before them are a batch."""
+    """Declaration of an array-valued field: its last axes have `shape`; axes before them are a batch.
 
-    shape: tuple[int, ...]
+    None in `shape` stands for any length of at least 1.
+    """
+
+    shape: tuple[int | None, ...]
     unit: str
     help: str
     symmetric: bool = False
 
     def allowed(self) -> str:
         kind = "symmetric finite" if self.symmetric else "finite"
-        return f"a {kind} array of shape {self.shape} [{self.unit}]"
+        shape = str(self.shape).replace("None", "n")
+        return f"a {kind} array of shape {shape} [{self.unit}]"
 
     def normalise(self, name: str, value: Any) -> Any:
         if isinstance(value, (list, tuple)):
             value = jnp.asarray(value) if _holds_tracers(value) else _from_list(name, value, self.allowed())
         if not hasattr(value, "shape"):
             raise InputError(name, value, self.allowed())
-        if self.shape[0] == 1 and value.shape == self.shape[1:]:
-            value = value.reshape(self.shape)  # a plain row is welcome where a one-row matrix is meant
-        if value.shape[-len(self.shape) :] != self.shape:
+        if self.shape[0] == 1 and len(self.shape) > 1 and _fits(value.shape, self.shape[1:]):
+            value = value.reshape((1, *value.shape))  # a plain row is welcome where a one-row matrix is meant
+        if not _fits(value.shape[-len(self.shape) :], self.shape):
             raise InputError(name, f"array of shape {value.shape}", self.allowed())
         numbers = _concrete_reals(name, value, self)
         if numbers is None:
@@ -130,7 +134,7 @@ def number(unit: str, help: str, *, default: Any = dataclasses.MISSING, **ends: 
     return dataclasses.field(default=default, metadata={_RULE: Number(unit, help, **ends)})
 
 
-def matrix(shape: tuple[int, ...], unit: str, help: str, *, symmetric: bool = False) -> Any:
+def matrix(shape: tuple[int | None, ...], unit: str, help: str, *, symmetric: bool = False) -> Any:
     """An array-valued field (see `Matrix`)."""
     return dataclasses.field(metadata={_RULE: Matrix(shape, unit, help, symmetric)})
 
@@ -187,6 +191,10 @@ def pytree(cls: type[T]) -> type[T]:
         return tree
 
     jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
+    fields = dataclasses.fields(made)
+    _COMPONENTS[made] = tuple(
+        f.name for f in fields if _RULE not in f.metadata and f.type in (Scalar, float, "Scalar", "float")
+    )
     return made
 
 
@@ -198,50 +206,127 @@ def is_traced(value: Any) -> bool:
 def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
     """Refuses a component that no rollout can run: JAX may have rebuilt it with anything.
 
+    Fields with a declared rule, and those annotated as `Scalar`, are held against it. All else that a component of a
+    user's own holds (arrays of any shape, trees of them, functions) is taken as it is.
+
     Args:
-      batch: how many components the tree may hold: each of its leaves may have a leading axis of this length.
+      batch: how many components the tree may hold: declared fields may have a leading axis of this length.
 
     Returns:
       For each leaf whether it has that axis.
 
     Raises:
-      InputError: a leaf that is no number, a number or matrix with another axis in front (which only `vmap` may take
-        away), or a concrete one outside its declared range.
+      InputError: a leaf that is neither a number nor a choice (a function, a text), a number or matrix with another
+        axis in front (which only `vmap` may take away), or a concrete one outside its declared range.
     """
-    leaves = jax.tree.leaves(tree)
-    strangers = [not (isinstance(leaf, (int, float)) or hasattr(leaf, "dtype")) for leaf in leaves]
-    if any(strangers):
-        path, leaf = jax.tree_util.tree_leaves_with_path(tree)[strangers.index(True)]
-        allowed = "a number; a class of your own is made a component by the decorator cpjax.pytree.pytree"
-        raise InputError(f"{name}{jax.tree_util.keystr(path)}", leaf, allowed)
-    batched = _check_fields(name, tree, batch) if dataclasses.is_dataclass(tree) else []
-    # A class that is a pytree in a way of its own has other leaves than fields; it is not looked into.
-    return batched if len(batched) == len(leaves) else [False] * len(leaves)
+    if is_component(tree):
+        return _check_fields(name, tree, batch)
+    batched: list[bool] = []
+    for path, node in jax.tree_util.tree_leaves_with_path(tree, is_leaf=is_component):
+        where = f"{name}{jax.tree_util.keystr(path)}"
+        if is_component(node):
+            batched += _check_fields(where, node, batch)
+        elif _is_number(node) or (path and _is_choice(node)):
+            batched.append(False)
+        else:
+            allowed = (
+                "a number; a class of your own is made a component by the decorator cpjax.pytree.pytree, or by "
+                "registering it with JAX as a pytree"
+            )
+            raise InputError(where, node, allowed)
+    return batched
+
+
+def is_component(node: Any) -> bool:
+    """Whether `node` is an instance of a class made by `pytree`."""
+    return type(node) in _COMPONENTS
+
+
+_COMPONENTS: dict[type, tuple[str, ...]] = {}
+"""Classes made by `pytree`, and their fields that hold one number each without declaring more."""
+
+
+def _is_number(leaf: Any) -> bool:
+    return isinstance(leaf, (int, float)) or hasattr(leaf, "dtype")
+
+
+def _is_choice(leaf: Any) -> bool:
+    return callable(leaf) or isinstance(leaf, str)
 
 
 def _check_fields(name: str, tree: Any, batch: int | None) -> list[bool]:
-    declared, batched = rules(type(tree)), []
+    declared, scalars = rules(type(tree)), _COMPONENTS[type(tree)]
+    batched: list[bool] = []
     for field in dataclasses.fields(tree):
         path, value, rule = f"{name}.{field.name}", getattr(tree, field.name), declared.get(field.name)
-        if dataclasses.is_dataclass(value):
+        if is_component(value):
             batched += _check_fields(path, value, batch)
-        elif isinstance(value, tuple):  # of components
-            for i, one in enumerate(value):
-                batched += check(f"{path}[{i}]", one, batch)
-        elif rule is not None or not declared:  # a State declares nothing and holds scalars
+        elif isinstance(rule, (Number, Matrix)) or (field.name in scalars and _is_number(value)):
             expected = rule.shape if isinstance(rule, Matrix) else ()
             shape = () if isinstance(value, float) else np.shape(value)
-            batched.append(shape != expected)
-            if batched[-1] and (batch is None or shape != (batch, *expected)):
+            fits = _fits(shape, expected)
+            batched.append(not fits)
+            if not fits and (batch is None or not _fits(shape, (batch, *expected))):
                 more = (
                     "batches go through jax.vmap" if batch is None else f"or {(batch, *expected)}, one for each start"
                 )
                 raise InputError(path, f"array of shape {shape}", f"of shape {expected}; {more}")
             if rule is not None:
                 rule.normalise(path, value)
-        else:
-            batched += [False] * len(jax.tree.leaves(value))
+        elif value is not None:
+            batched += [False] if _is_choice(value) and _is_leaf(value) else check(path, value, batch)
     return batched
+
+
+def _is_leaf(value: Any) -> bool:
+    return jax.tree_util.all_leaves([value])
+
+
+def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
+    """Whether a shape is the expected one, in which None stands for any length."""
+    return len(shape) == len(expected) and all(
+        wanted in (None, length) for length, wanted in zip(shape, expected, strict=True)
+    )
+
+
+class Hidden:
+    """A leaf that is no number (a function, a text), as a pytree without leaves: it is part of what is compiled."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+
+jax.tree_util.register_pytree_node(Hidden, lambda node: ((), node.value), lambda value, _: Hidden(value))
+
+
+def hide(name: str, tree: T) -> T:
+    """Returns the tree with every leaf that is no number hidden from JAX, so that the tree can be traced.
+
+    Raises:
+      InputError: such a leaf cannot be hashed.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    if all(_is_number(leaf) for leaf in leaves):
+        return tree
+    for i, leaf in enumerate(leaves):
+        if not _is_number(leaf):
+            try:
+                hash(leaf)
+            except TypeError as problem:
+                raise InputError(name, leaf, "a component whose choices can be hashed") from problem
+            leaves[i] = Hidden(leaf)
+    hidden: T = jax.tree.unflatten(structure, leaves)
+    return hidden
+
+
+def reveal(tree: T) -> T:
+    """Undoes `hide`."""
+
+    def is_hidden(node: Any) -> bool:
+        return isinstance(node, Hidden)
+
+    revealed: T = jax.tree.map(lambda node: node.value if is_hidden(node) else node, tree, is_leaf=is_hidden)
+    return revealed
 
 
 def cast(tree: T, dtype: Any) -> T:

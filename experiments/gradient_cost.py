@@ -36,7 +36,7 @@ def objective(switching: Any, checkpoint: Any, duration: float) -> Callable[[Map
         )
         settings: dict[str, Any] = {"switching": switching, "checkpoint": checkpoint}
         found: jax.Array = cpjax.measure(
-            plant, law, start, duration=duration, dt=DT, metrics=cpjax.TimeOutside(), **settings
+            plant, law, start, clock="continuous", duration=duration, dt=DT, metrics=cpjax.TimeOutside(), **settings
         )
         return found
 

@@ -16,6 +16,7 @@ ROOMS = [
     "pytree",
     "runtime",
     "compilation",
+    "returned",
     "numeric",
     "state",
     "starts",

@@ -256,7 +256,9 @@ def test_a_part_of_the_wrong_kind_is_refused(cls, field, allowed, value):
 @pytest.mark.parametrize("x", [math.nan, math.inf, "1", None, True, 1j, [1.0]], ids=repr)
 def test_a_reference_that_is_no_state_of_finite_numbers_is_refused(x):
     with pytest.raises(InputError, match=r"reference.*\bx\b"):
-        rollout(PLANT, StateFeedback(LAW.K, State(x, 0.0, 0.0, 0.0)), HANGING, duration=0.1, dt=0.01)
+        rollout(
+            PLANT, StateFeedback(LAW.K, State(x, 0.0, 0.0, 0.0)), HANGING, clock="continuous", duration=0.1, dt=0.01
+        )
 
 
 @pytest.mark.parametrize("cls", [CartPole, AngleGate, ProtocolMetrics])
@@ -271,9 +273,9 @@ def test_an_empty_batch_of_numbers_is_refused(cls):
     [
         lambda: CartPole(cart_mass=HUGE),
         lambda: StateFeedback([HUGE, 0, 0, 0]),
-        lambda: rollout(PLANT, LAW, State(HUGE, 0.0, 0.0, 0.0), duration=1.0, dt=0.1),
-        lambda: rollout(PLANT, LAW, HANGING, duration=HUGE, dt=0.1),
-        lambda: rollout(PLANT, LAW, HANGING, duration=1.0, dt=HUGE),
+        lambda: rollout(PLANT, LAW, State(HUGE, 0.0, 0.0, 0.0), clock="continuous", duration=1.0, dt=0.1),
+        lambda: rollout(PLANT, LAW, HANGING, clock="continuous", duration=HUGE, dt=0.1),
+        lambda: rollout(PLANT, LAW, HANGING, clock="continuous", duration=1.0, dt=HUGE),
         lambda: wilson_interval(1, HUGE),
     ],
     ids=["field", "matrix", "start", "duration", "dt", "trials"],
@@ -321,16 +323,16 @@ def run(function=rollout, plant=PLANT, controller=LAW, start=HANGING, **settings
         *(({"duration": v}, "duration", repr(v), SECONDS) for v in (0, -1.0, math.nan, math.inf, True, None, 1j, "x")),
         ({"duration": 1e300}, "duration", "1e+300", "fewer than 2^31 steps"),
         ({"duration": 1e7, "dt": 1e-3}, "duration", "10000000.0", "fewer than 2^31 steps"),
-        ({"control_period": 0.02}, "control_period", "0.02", "absent unless clock is sampled"),
+        ({"clock": "continuous", "control_period": 0.02}, "control_period", "0.02", "absent unless clock is sampled"),
         ({**SAMPLED, "control_period": 0.005}, "control_period", "0.005", "at least one step, dt = 0.01 s"),
         ({**SAMPLED, "control_period": 0.025}, "control_period", "0.025", "a whole multiple of dt = 0.01 s"),
         *(
             ({**SAMPLED, "control_period": v}, "control_period", repr(v), SECONDS)
             for v in (0.0, -1, math.nan, True, "x")
         ),
-        *(({"clock": v}, "clock", repr(v), "continuous or sampled") for v in ("Sampled", "", None, 1, [], {})),
+        *(({"clock": v}, "clock", repr(v), "continuous or sampled") for v in ("Sampled", "", 1, [], {})),
         *(({"integrator": v}, "integrator", repr(v), "one of rk4, ") for v in ("RK4", "", None, 4, [], {}, ["rk4"])),
-        *(({"switching": v}, "switching", repr(v), "per_step") for v in ("events", None, 0, [])),
+        *(({"switching": v}, "switching", repr(v), "per_step") for v in ("events", 0, [])),
     ],
     ids=str,
 )
@@ -695,7 +697,7 @@ def test_the_same_run_with_a_sane_gain_is_a_success_without_a_flag():
 def test_a_run_that_starts_outside_the_limits_is_flagged_at_once_and_held_there():
     @jax.jit  # outside jit such a start is refused
     def run(x):
-        return rollout(OPEN, LAW, State(x, 0.0, 0.0, 0.0), duration=1.0, dt=0.01)
+        return rollout(OPEN, LAW, State(x, 0.0, 0.0, 0.0), clock="continuous", duration=1.0, dt=0.01)
 
     result = run(2e3)
     assert int(result.flag) == Flag.RUNAWAY

@@ -35,6 +35,8 @@ def law(function):
 
 def effort(start, controller, **options):
     options = {"clock": "sampled", "duration": 0.1, "dt": 0.002} | options
+    if options.get("switching") != "located":
+        options["derivative"] = "pathwise"
     return cpjax.measure(PLANT, controller, start, **options).effort
 
 

@@ -86,7 +86,7 @@ THINGS = {
         state=State(*np.array([AWKWARD] * 4)),
         voltage=np.float32(AWKWARD),
         mode=np.array([0, 1, 1, 0], dtype=np.int32),
-        cart_acceleration=np.array([math.nan, math.inf, -math.inf, 0.0]),
+        outputs={"cart_acceleration": np.array([math.nan, math.inf, -math.inf, 0.0])},
         flag=np.array(2, dtype=np.int32),
         metrics=METRICS,
     ),
@@ -163,7 +163,7 @@ def test_every_type_that_can_be_saved_is_in_the_round_trips():
 @both_formats
 def test_a_rollout_is_saved_with_its_metrics(tmp_path, extension):
     path = tmp_path / f"run.{extension}"
-    run = rollout(PLANT, LAW, State(np.float32(0.1), 0.0, 3.0, 0.0), duration=0.1, dt=0.05)
+    run = rollout(PLANT, LAW, State(np.float32(0.1), 0.0, 3.0, 0.0), clock="continuous", duration=0.1, dt=0.05)
     io.save(path, run)
     loaded = io.load(path)
     assert isinstance(loaded.metrics, Metrics)
@@ -173,9 +173,7 @@ def test_a_rollout_is_saved_with_its_metrics(tmp_path, extension):
 @both_formats
 def test_metrics_of_a_users_own_kind_are_refused_when_saved(tmp_path, extension):
     trajectory = THINGS["Trajectory"]
-    fields = {
-        name: getattr(trajectory, name) for name in ("time", "state", "voltage", "mode", "cart_acceleration", "flag")
-    }
+    fields = {name: getattr(trajectory, name) for name in ("time", "state", "voltage", "mode", "outputs", "flag")}
     with pytest.raises(InputError, match="metrics"):
         io.save(tmp_path / f"run.{extension}", Trajectory(**fields, metrics={"final": jnp.ones(2)}))
 

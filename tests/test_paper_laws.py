@@ -136,7 +136,7 @@ def test_the_corrected_law_reaches_the_energy_of_upright_only_where_the_voltage_
         plant = dataclasses.replace(APPENDIX, motor=dataclasses.replace(APPENDIX.motor, voltage_limit=limit))
         fold = Reach(plant, 50.0)
         law = paper.LAWS["corrected"](plant)
-        run = cpjax.measure(plant, law, at(math.pi - 0.1), duration=60.0, dt=0.002, metrics=fold)
+        run = cpjax.measure(plant, law, at(math.pi - 0.1), clock="continuous", duration=60.0, dt=0.002, metrics=fold)
         return float(run[2]), float(run[3])
 
     low, high = late_energy(math.inf)

@@ -127,7 +127,9 @@ def test_without_drive_and_friction_the_total_energy_is_conserved(plant):
         theta_dot=jnp.asarray([0.5, -1.0, 0.0, 3.0]),
     )
     rest = StateFeedback([0.0, 0.0, 0.0, 0.0])
-    run = jax.vmap(lambda start: cpjax.rollout(plant, rest, start, duration=10.0, dt=1e-3).state)(starts)
+    run = jax.vmap(lambda start: cpjax.rollout(plant, rest, start, clock="continuous", duration=10.0, dt=1e-3).state)(
+        starts
+    )
     assert np.all(np.ptp(run.theta, axis=1) > 0.3)  # it did swing
     energy = jax.vmap(jax.vmap(lambda state: sum(energies(plant, *coordinates(state)))))(run)
     assert np.max(np.abs(energy - energy[:, :1])) <= 1e-9 * weight

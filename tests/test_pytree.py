@@ -245,7 +245,7 @@ def test_gradients_flow_through_every_constructor():
             jnp.stack([-30.0, numbers["gain"], 110.0, 28.0]), reference=State(numbers["x"], 0.0, 0.0, 0.0)
         )
         start = State(0.1, 0.0, numbers["theta"], 0.0)
-        return measure(plant, law, start, duration=0.2, dt=0.01).effort
+        return measure(plant, law, start, clock="continuous", duration=0.2, dt=0.01).effort
 
     numbers = {"resistance": 1.25, "cart_mass": 1.0, "gain": -25.0, "x": 0.2, "theta": 0.3}
     jitted = jax.jit(effort)

@@ -19,7 +19,7 @@ from jax import lax
 from cpjax.bridges.known import UNTRACEABLE, known_plant, refuse_unknown
 from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.hybrid import Hybrid
-from cpjax.controllers.protocol import Controller, Law, SingleLaw, as_controller
+from cpjax.controllers.protocol import Law, ModalController, SingleLaw, as_controller
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor, linearize
 from cpjax.pytree import Number, cast, is_traced
@@ -83,7 +83,7 @@ def plant_system(plant: CartPole) -> control.NonlinearIOSystem:
 
 
 def closed_loop_system(
-    plant: CartPole, controller: Controller | Law, control_period: float | None = None, *, dt: float | None = None
+    plant: CartPole, controller: ModalController | Law, control_period: float | None = None, *, dt: float | None = None
 ) -> control.NonlinearIOSystem:
     """Plant and controller as one system without inputs. Outputs: the four states, the applied voltage, the mode.
 
@@ -104,6 +104,8 @@ def closed_loop_system(
         do not, nor does a `cpjax.Hybrid` whose gate has hysteresis 0.
     """
     plant, controller = known_plant(plant), as_controller(controller)
+    if not isinstance(controller, ModalController):
+        raise InputError("controller", controller, "a law, or a controller whose only memory is its mode")
     refuse_unknown("controller", controller)
     if control_period is not None:
         return _sampled_loop(plant, controller, control_period, dt)
@@ -182,7 +184,7 @@ def _saturation(motor: Motor) -> Callable[[float], float]:
     return lambda voltage: max(min(voltage, limit), -limit)
 
 
-def _continuous_loop(plant: CartPole, controller: Controller) -> control.NonlinearIOSystem:
+def _continuous_loop(plant: CartPole, controller: ModalController) -> control.NonlinearIOSystem:
     dtype = jnp.result_type(float)
     arrays, controller = cast((plant, controller), dtype)
 
@@ -198,12 +200,12 @@ def _continuous_loop(plant: CartPole, controller: Controller) -> control.Nonline
     return _loop_system(update, act, NAMES, 0)
 
 
-def _sampled_loop(plant: CartPole, controller: Controller, period: Any, dt: Any) -> control.NonlinearIOSystem:
+def _sampled_loop(plant: CartPole, controller: ModalController, period: Any, dt: Any) -> control.NonlinearIOSystem:
     if is_traced(period) or np.ndim(period):
         raise InputError("control_period", period, _PERIOD.allowed())
     period = float(_PERIOD.normalise("control_period", period))
     dt = period if dt is None else dt
-    steps = check_settings(dt, dt, "sampled", period, "per_step", "rk4", None).steps_per_control
+    steps = check_settings(duration=dt, dt=dt, control_period=period).steps_per_control
     dtype = jnp.result_type(float)
     plant, controller, step = cast((plant, controller, float(dt)), dtype)
 
@@ -242,7 +244,7 @@ def _loop_system(
     )
 
 
-def _may_remember(controller: Controller) -> bool:
+def _may_remember(controller: ModalController) -> bool:
     """Whether `next_mode` may depend on the mode until now; of a stranger's gate or controller nothing is known."""
     if isinstance(controller, SingleLaw):
         return False

@@ -4,7 +4,21 @@ from cpjax.controllers.energy import EnergySwingUp
 from cpjax.controllers.feedback import Design, LqrWeights, PoleFactors, StateFeedback
 from cpjax.controllers.gates import AngleGate, AngleRateGate, Gate, LyapunovGate
 from cpjax.controllers.hybrid import Hybrid
-from cpjax.controllers.protocol import REGULATE, SWING_UP, Controller, Law, SingleLaw, SmoothController, as_controller
+from cpjax.controllers.protocol import (
+    REGULATE,
+    SWING_UP,
+    Clocked,
+    Controller,
+    Law,
+    ModalController,
+    ModeMemory,
+    Sampled,
+    SingleLaw,
+    SmoothController,
+    as_controller,
+    as_sampled,
+)
+from cpjax.controllers.signal import VoltageSignal
 from cpjax.controllers.smooth import SmoothClip, SmoothHybrid
 
 __all__ = [
@@ -12,6 +26,7 @@ __all__ = [
     "SWING_UP",
     "AngleGate",
     "AngleRateGate",
+    "Clocked",
     "Controller",
     "Design",
     "EnergySwingUp",
@@ -20,11 +35,16 @@ __all__ = [
     "Law",
     "LqrWeights",
     "LyapunovGate",
+    "ModalController",
+    "ModeMemory",
     "PoleFactors",
+    "Sampled",
     "SingleLaw",
     "SmoothClip",
     "SmoothController",
     "SmoothHybrid",
     "StateFeedback",
+    "VoltageSignal",
     "as_controller",
+    "as_sampled",
 ]

@@ -8,8 +8,9 @@ import numpy as np
 
 from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.gates import Gate
-from cpjax.controllers.protocol import REGULATE, SWING_UP, Law
+from cpjax.controllers.protocol import REGULATE, SWING_UP, Law, ModeMemory, start_memory, update_mode
 from cpjax.pytree import Scalar, part, pytree
+from cpjax.returned import call, real
 from cpjax.state import State
 
 
@@ -25,26 +26,41 @@ class Hybrid:
     regulator: Law = part("a law", "voltage")
     gate: Gate = part("a gate", "margin")
 
+    def init(self, measurement: State) -> ModeMemory:
+        """Returns the mode at the first measurement: the controller's whole memory."""
+        return start_memory(self, measurement)
+
+    def update(self, memory: ModeMemory, measurement: State) -> tuple[ModeMemory, Scalar]:
+        """Returns the next mode, and the voltage that its law demands [V]."""
+        return update_mode(self, memory, measurement)
+
     def start_mode(self, state: State) -> jax.Array:
         """REGULATE inside the way in, SWING_UP elsewhere."""
         return self.next_mode(state, jnp.asarray(SWING_UP, dtype=jnp.int32))
 
     def next_mode(self, state: State, mode: jax.Array) -> jax.Array:
         """REGULATE where the gate's margin in the present mode is at least 0. Has no derivative: it is a switch."""
-        return jnp.where(self.gate.margin(state, mode) >= 0.0, np.int32(REGULATE), np.int32(SWING_UP))
+        return jnp.where(self._gate_margin(state, mode) >= 0.0, np.int32(REGULATE), np.int32(SWING_UP))
 
     def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
         """Both laws are evaluated and one is taken; the other, if finite, contributes neither value nor derivative."""
-        return jnp.where(mode == REGULATE, self.regulator.voltage(state), self.swing_up.voltage(state))
+        regulate, swing_up = (
+            real(f"controller.{name}.voltage", call(f"controller.{name}", getattr(self, name), "voltage", state))
+            for name in ("regulator", "swing_up")
+        )
+        return jnp.where(mode == REGULATE, regulate, swing_up)
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
         """The gate's margin, with the sign that keeps `mode` where it is positive."""
-        margin = self.gate.margin(state, mode)
+        margin = self._gate_margin(state, mode)
         return jnp.where(mode == REGULATE, margin, -margin)
 
     def successor(self, mode: jax.Array) -> jax.Array:
         """The other one."""
         return (SWING_UP + REGULATE) - mode
+
+    def _gate_margin(self, state: State, mode: jax.Array) -> jax.Array:
+        return real("controller.gate.margin", call("controller.gate", self.gate, "margin", state, mode))
 
 
 def without_design(controller: Hybrid) -> Hybrid:

@@ -1,16 +1,25 @@
 """What a rollout asks of a controller.
 
-A `Law` is a function of the state. A `Controller` also has a mode, which the rollout remembers for it between control
-instants: a gate with hysteresis depends on where the state came from, so the mode is part of the simulation's state.
+On the sampled clock a `Controller` is what runs in firmware: once per control period it takes a measurement and its
+memory, any pytree, and returns the new memory and a command. A memoryless law, a hybrid with its mode, a PID with its
+integral, an observer with its estimate are all of this kind.
+
+The continuous clock, on which a change of mode can be located inside a step, needs to know more: a law for each mode,
+and a smooth function that vanishes where a mode ends (`ModalController`, `SmoothController`). It knows no other memory
+than the mode.
+
+A class of any kind will do as long as JAX knows it as a pytree: one made by `cpjax.pytree.pytree`, a dataclass
+registered with JAX, an `equinox.Module`.
 """
 
-from typing import Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 
 from cpjax.errors import InputError
 from cpjax.pytree import Scalar, part, pytree
+from cpjax.returned import call, integer, real
 from cpjax.state import State
 
 SWING_UP = 0
@@ -25,71 +34,186 @@ class Law(Protocol):
     """A memoryless law."""
 
     def voltage(self, state: State) -> Scalar:
-        """Demanded terminal voltage [V]; the motor clips it."""
+        """Returns the demanded terminal voltage [V], a scalar; the motor clips it."""
         ...
 
 
 @runtime_checkable
 class Controller(Protocol):
-    """A law for each mode, and the rule that chooses the mode. Modes are int32 scalars."""
+    """A controller with memory, on the sampled clock."""
 
-    def start_mode(self, state: State) -> jax.Array:
-        """Mode at the start of a rollout, when there is no earlier mode to remember."""
+    def init(self, measurement: Any) -> Any:
+        """Returns the memory before the first update, given the first measurement."""
         ...
 
-    def next_mode(self, state: State, mode: jax.Array) -> jax.Array:
-        """Mode from this control instant on, given the mode until now."""
-        ...
+    def update(self, memory: Any, measurement: Any) -> tuple[Any, Scalar]:
+        """Returns the new memory, of the same structure, shapes and dtypes, and the command [V], a scalar.
 
-    def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
-        """Demanded terminal voltage [V] of the law that acts in `mode`; the motor clips it."""
+        Called once per control period. The drive clips the command and holds it until the next update.
+        """
         ...
 
 
 @runtime_checkable
-class SmoothController(Controller, Protocol):
+class ModalController(Protocol):
+    """A law for each mode, and the rule that chooses the mode. Modes are int32 scalars."""
+
+    def start_mode(self, state: State) -> jax.Array:
+        """Returns the mode at the start of a rollout, when there is no earlier mode to remember."""
+        ...
+
+    def next_mode(self, state: State, mode: jax.Array) -> jax.Array:
+        """Returns the mode from this control instant on, given the mode until now."""
+        ...
+
+    def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
+        """Returns the demanded terminal voltage [V] of the law that acts in `mode`; the motor clips it."""
+        ...
+
+
+@runtime_checkable
+class SmoothController(ModalController, Protocol):
     """A controller whose mode ends where a smooth function vanishes, so that the moment can be located."""
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
-        """At least 0 while `mode` lasts, smooth in the state near 0."""
+        """Returns a number that is at least 0 while `mode` lasts, smooth in the state near 0."""
         ...
 
     def successor(self, mode: jax.Array) -> jax.Array:
-        """Mode after `mode`, once its margin has vanished."""
+        """Returns the mode after `mode`, once its margin has vanished."""
         ...
+
+
+@runtime_checkable
+class Clocked(Protocol):
+    """A part of a controller that depends on the control period, such as a filter, or on time."""
+
+    def at_period(self, period: Scalar) -> Any:
+        """Returns what takes its place in a loop of this control period [s].
+
+        A rollout calls this once, before it begins, on every such part of a controller.
+        """
+        ...
+
+
+class ModeMemory(NamedTuple):
+    """The memory of a controller with modes. The loop finds it in any memory, and records the mode.
+
+    Attributes:
+      mode: int32, since the last update.
+      margin: of that mode at the last update; only where the derivative of the mean is asked for, else None.
+      shift: by how much of a control period the last change of mode moves with the parameters: value 0, and the
+        derivative of the moment of crossing; else None.
+    """
+
+    mode: jax.Array
+    margin: jax.Array | None = None
+    shift: jax.Array | None = None
+
+
+def modes_in(memory: Any) -> list[ModeMemory]:
+    """Returns every `ModeMemory` in a controller's memory, outermost first."""
+    nodes = jax.tree.leaves(memory, is_leaf=lambda node: isinstance(node, ModeMemory))
+    return [node for node in nodes if isinstance(node, ModeMemory)]
+
+
+def update_mode(controller: ModalController, memory: ModeMemory, state: State) -> tuple[ModeMemory, Scalar]:
+    """Runs a modal controller for one control period: the next mode, and the voltage that its law demands."""
+    mode = integer("controller.next_mode", call("controller", controller, "next_mode", state, memory.mode))
+    return ModeMemory(mode), demand(controller, state, mode)
+
+
+def start_memory(controller: ModalController, state: State) -> ModeMemory:
+    """Returns a modal controller's memory at the start of a rollout."""
+    return ModeMemory(integer("controller.start_mode", call("controller", controller, "start_mode", state)))
+
+
+def demand(controller: ModalController, state: State, mode: jax.Array) -> jax.Array:
+    """Returns the voltage [V] that the law of `mode` demands, in the state's dtype."""
+    return real("controller.mode_voltage", call("controller", controller, "mode_voltage", state, mode))
 
 
 @pytree
 class SingleLaw:
-    """A `Law` as a `Controller` that never leaves mode 0."""
+    """A `Law` as a controller that never leaves mode 0."""
 
     law: Law = part("a law", "voltage")
 
+    def init(self, measurement: State) -> tuple[()]:
+        return ()
+
+    def update(self, memory: tuple[()], measurement: State) -> tuple[tuple[()], Scalar]:
+        return (), self._voltage(measurement)
+
     def start_mode(self, state: State) -> jax.Array:
-        return jnp.zeros_like(state.x, dtype=jnp.int32)
+        return jnp.asarray(SWING_UP, dtype=jnp.int32)
 
     def next_mode(self, state: State, mode: jax.Array) -> jax.Array:
         return mode
 
     def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
-        return self.law.voltage(state)
+        return self._voltage(state)
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
-        return jnp.ones_like(state.x)
+        return 1.0
 
     def successor(self, mode: jax.Array) -> jax.Array:
         return mode
 
+    def _voltage(self, state: State) -> jax.Array:
+        return real("controller.voltage", call("controller", self.law, "voltage", state))
 
-def as_controller(controller: Controller | Law) -> Controller:
-    """`controller` itself, or a bare law as a controller.
+
+@pytree
+class Sampled:
+    """A `ModalController` of a user's as a `Controller`: its memory is its mode."""
+
+    controller: ModalController = part("a controller with modes", "start_mode", "next_mode", "mode_voltage")
+
+    def init(self, measurement: State) -> ModeMemory:
+        return start_memory(self.controller, measurement)
+
+    def update(self, memory: ModeMemory, measurement: State) -> tuple[ModeMemory, Scalar]:
+        return update_mode(self.controller, memory, measurement)
+
+
+def as_controller(controller: Any) -> Any:
+    """Returns `controller` itself, or a bare law as a controller.
 
     Raises:
-      InputError: it is neither.
+      InputError: it is neither a `Controller`, nor a `ModalController`, nor a `Law`.
     """
     if not isinstance(controller, type):  # a class has the methods too, but no parameters
-        if isinstance(controller, Controller):
+        if isinstance(controller, (Controller, ModalController)):
             return controller
         if isinstance(controller, Law):
             return SingleLaw(controller)
-    raise InputError("controller", controller, "a controller such as cpjax.Hybrid, or a law with voltage(state)")
+    allowed = (
+        "a controller such as cpjax.Hybrid, or a law with voltage(state), "
+        "or a controller with init(measurement) and update(memory, measurement)"
+    )
+    raise InputError("controller", controller, allowed)
+
+
+def as_sampled(controller: Any) -> Controller:
+    """Returns a law, or a controller of either kind, as a `Controller` with `init` and `update`.
+
+    For controllers that hold another one, such as an observer.
+
+    Raises:
+      InputError: as `as_controller` does.
+    """
+    controller = as_controller(controller)
+    return controller if isinstance(controller, Controller) else Sampled(controller)
+
+
+def at_period(controller: Any, period: Scalar) -> Any:
+    """Returns the controller with every `Clocked` part told the control period [s]."""
+
+    def is_clocked(node: Any) -> bool:
+        return isinstance(node, Clocked) and not isinstance(node, type)
+
+    def told(node: Any) -> Any:
+        return call("controller", node, "at_period", period) if is_clocked(node) else node
+
+    return jax.tree.map(told, controller, is_leaf=is_clocked)

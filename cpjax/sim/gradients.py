@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from cpjax.errors import InputError
-from cpjax.state import State, checked_start
+from cpjax.sim.initial import checked_tree
+from cpjax.state import State
 
 Direction: TypeAlias = Literal["reverse", "forward"]
 Objective: TypeAlias = Callable[[Any, State], jax.Array]
@@ -52,7 +53,8 @@ def gradients(
         if not (isinstance(leaf, float) or jnp.issubdtype(getattr(leaf, "dtype", int), jnp.floating)):
             name = f"parameters{jax.tree_util.keystr(path)}"
             raise InputError(name, leaf, "a float or a floating-point array")
-    starts, _ = checked_start(starts, "starts", batched=True)
+    limits = jax.tree.map(lambda _: math.inf, starts)
+    starts, _, _ = checked_tree(starts, limits, {}, "starts", batched=True)
     shape = jax.eval_shape(objective, parameters, jax.tree.map(lambda column: column[0], starts))
     if getattr(shape, "shape", None) != ():
         raise InputError("objective", objective, f"a function that returns one number, not {shape}")

@@ -1,8 +1,9 @@
-"""The closed loop on the continuous clock with its changes of mode located: see `switching.py`.
+"""The closed loop with its events located inside the steps: see `switching.py`.
 
-Each iteration is one step of the automaton there. What the clip does to the voltage is a mode too: where a demanded
-voltage reaches the limit, the vector field has a kink, over which a Runge-Kutta step loses its order, and its
-derivatives with it.
+Each iteration is one step of the automaton there. On the continuous clock the events are the controller's changes of
+mode, the plant's own events, and the moments at which the voltage reaches the limit or leaves it: there the vector
+field has a kink, over which a Runge-Kutta step loses its order, and its derivatives with it. On the sampled clock the
+input is held between control instants, so that only the plant's own events are left.
 """
 
 import functools
@@ -13,17 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from cpjax.compilation import one_function, part_of_step
-from cpjax.controllers.protocol import SmoothController
-from cpjax.plant import CartPole
-from cpjax.sim.flags import CHATTER_LENGTH, STOPPED, Flag, unknown
+from cpjax.returned import call, like
+from cpjax.sim import failures, plants
+from cpjax.sim.closed_loop import ContinuousLoop, HeldLoop, HeldMode, System
+from cpjax.sim.flags import CHATTER_LENGTH, Flag, unknown
 from cpjax.sim.integrators import INTEGRATORS, Integrator
 from cpjax.sim.kept import pack
 from cpjax.sim.metrics import Fold, Sample
+from cpjax.sim.per_step import mode_of, start_controller, update_controller, update_metric
+from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
-from cpjax.sim.stepper import ClosedLoop
-from cpjax.sim.switching import LANDED, RUN, Motion, iterate, pick, start_motion
-from cpjax.state import RUNAWAY_LIMIT, State, within_bounds
+from cpjax.sim.switching import LANDED, RUN, Motion, iterate, observe, pick, start_motion
 
 
 class _Loop(NamedTuple):
@@ -35,22 +37,38 @@ class _Loop(NamedTuple):
     """At the sample before [V]."""
     mode: jax.Array
     """At the sample before."""
+    memory: Any
+    """The controller's, on the sampled clock; else ()."""
+    changes: jax.Array
+    """Control instants in a row at which the mode changed, on the sampled clock."""
 
 
 def simulate(
-    start: State, plant: CartPole, controller: SmoothController, fold: Fold, dt: jax.Array, settings: Settings
+    start: Tree, plant: Plant, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
 ) -> tuple[jax.Array | None, Sample, Any]:
-    """The samples that are kept but for the last, packed (None if none are), the last one, and what the fold made of
-    all of them."""
-    system = ClosedLoop(plant, controller)
-    motion = start_motion(system, (start.x, start.theta), (start.x_dot, start.theta_dot), system.start_mode(start), dt)
-    loop = _Loop(motion, unknown((start, plant, controller)), motion.seen.output, motion.mode.law)
-    first = _sample(loop, motion, dt)
+    """Simulates one start; see `cpjax.sim.rollout.simulate`."""
+    q, v = plants.coordinates(plant, start)
+    flag = unknown((start, plant, controller))
+    system: System
+    mode: Any
+    memory: Any
+    if settings.clock == "continuous":
+        system = ContinuousLoop(plant, controller)
+        mode, memory = system.start_mode(start), ()
+    else:
+        system = HeldLoop(plant)
+        memory, _ = start_controller(plant, controller, start, settings)
+        memory, given = update_controller(plant, controller, memory, start, settings)
+        mode = HeldMode(given.applied, plants.start_mode(plant, q, v))
+    motion = start_motion(system, q, v, mode, dt)
+    loop = _Loop(motion, flag, motion.seen.output, _law(motion, memory), memory, jnp.zeros_like(flag))
+    first = _sample(plant, loop, motion, dt)
 
     run = one_function(functools.partial(_run, settings=settings), stacks=True)
-    carry, kept = run((loop, fold.update(fold.init(first), first)), system, fold, dt)
+    carry = (loop, fold.update(call("metrics", fold, "init", first), first))
+    carry, kept = run(carry, plant, controller, fold, dt)
     loop, memory = carry
-    last = _sample(loop, loop.motion, dt)
+    last = _sample(plant, loop, loop.motion, dt)
     samples = None
     if kept is not None:
         samples, passed = kept
@@ -62,20 +80,20 @@ def simulate(
 
 
 def _run(
-    carry: tuple[_Loop, Any], system: ClosedLoop, fold: Fold, dt: jax.Array, settings: Settings
+    carry: tuple[_Loop, Any], plant: Plant, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
 ) -> tuple[tuple[_Loop, Any], tuple[jax.Array, jax.Array] | None]:
-    """Loop and memory after all iterations; and, of each, its sample, packed, and how many grid points it has passed,
-    if samples are kept."""
-    integrator, steps = INTEGRATORS[settings.integrator], settings.steps
-    iterations = steps + settings.spare_steps
+    """Returns loop and metric after all iterations; and, of each, its sample, packed, and how many grid points it has
+    passed, if samples are kept."""
+    iterations = settings.steps + settings.spare_steps
 
     def body(
         carry: tuple[_Loop, Any], index: jax.Array
     ) -> tuple[tuple[_Loop, Any], tuple[jax.Array, jax.Array] | None]:
         before, memory = carry
-        loop, reached = _advance(system, integrator, before, dt, steps, iterations - index)
-        sample = _sample(loop, before.motion, dt)
-        updated = part_of_step(type(fold).update)(fold, memory, sample), sample.voltage, sample.mode
+        loop, reached = _advance(plant, controller, before, dt, settings, iterations - index)
+        sample = _sample(plant, loop, before.motion, dt)
+        after = like("metrics.update", part_of_step(update_metric)(fold, memory, sample), memory)
+        updated = after, sample.voltage, sample.mode
         kept = memory, loop.voltage, loop.mode
         memory, voltage, mode = jax.tree.map(lambda new, old: jnp.where(reached, new, old), updated, kept)
         loop = loop._replace(voltage=voltage, mode=mode)
@@ -84,20 +102,28 @@ def _run(
     return scan(body, carry, jnp.arange(iterations, dtype=jnp.int32), settings.checkpoint)
 
 
-def _sample(loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
-    """At the last point that was reached; `before` is the motion an iteration earlier."""
+def _law(motion: Motion, memory: Any) -> jax.Array:
+    """Returns the controller's mode."""
+    return mode_of(memory) if isinstance(motion.mode, HeldMode) else motion.mode.law
+
+
+def _sample(plant: Plant, loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
+    """Returns the sample at the last point that was reached; `before` is the motion an iteration earlier."""
     motion = loop.motion
-    landed = (before.stage == LANDED) & ((loop.flag & STOPPED) == 0)
+    held = isinstance(motion.mode, HeldMode)
+    landed = (before.stage == LANDED) & ~failures.is_stopped(loop.flag)
+    state = plants.state_of(plant, motion.q, motion.v)
     return Sample(
         time=motion.passed.astype(dt.dtype) * dt + motion.offset,
         elapsed=motion.elapsed,
-        state=State(motion.q[0], motion.v[0], motion.q[1], motion.v[1]),
+        state=state,
         voltage=motion.seen.output,
         voltage_since=loop.voltage,
-        voltage_until=jnp.where(landed, before.seen.output, motion.seen.output),
-        mode=motion.mode.law,
+        voltage_until=None if held else jnp.where(landed, before.seen.output, motion.seen.output),
+        mode=_law(motion, loop.memory),
         mode_before=loop.mode,
-        cart_acceleration=jnp.asarray(motion.seen.acceleration[0]),
+        outputs=plants.outputs(plant, state, motion.seen.acceleration, motion.seen.output),
+        plant_mode=motion.mode.plant,
         flag=loop.flag,
         crossing=jnp.where(landed, before.guard + 1, 0),
         crossing_speed=jnp.where(landed, -pick(before.slopes, before.guard), 0.0),
@@ -105,35 +131,51 @@ def _sample(loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
 
 
 def _advance(
-    system: ClosedLoop, integrator: Integrator, loop: _Loop, dt: jax.Array, steps: int, left: jax.Array
+    plant: Plant, controller: Any, loop: _Loop, dt: jax.Array, settings: Settings, left: jax.Array
 ) -> tuple[_Loop, jax.Array]:
-    """One iteration. A run that would leave the bounds, become non-finite, or not end in the iterations that are left,
-    is held at the last point and flagged; its samples go on.
-
-    As on the other path (`per_step.py`), a step that is about to go wrong is taken from upright rest and dropped, so
-    that no infinity of a branch that is not taken reaches a derivative.
-    """
+    """Makes one iteration. A run that goes wrong, or does not end in the iterations that are left, is held at the last
+    point and flagged (see `failures.py`); its samples go on."""
+    integrator: Integrator = INTEGRATORS[settings.integrator]
+    held = settings.clock == "sampled"
+    system: System = HeldLoop(plant) if held else ContinuousLoop(plant, controller)
     motion = loop.motion
-    stopped, ended = (loop.flag & STOPPED) != 0, motion.passed >= steps
-    acceleration = motion.seen.acceleration
-    ahead = motion.v[0] + dt * acceleration[0], motion.v[1] + dt * acceleration[1]
-    going = ~stopped & ~ended & (jnp.abs(ahead[0]) <= RUNAWAY_LIMIT) & (jnp.abs(ahead[1]) <= RUNAWAY_LIMIT)
-    safe = jax.tree.map(lambda x: jnp.where(going, x, 0), motion)
-    after, reached = iterate(system, integrator, safe, dt)
-    within = within_bounds(State(after.q[0], after.v[0], after.q[1], after.v[1]))
-    in_time = left > steps - after.passed
-    good = going & within & in_time
-    finite = jnp.isfinite(ahead[0] + ahead[1] + after.q[0] + after.v[0] + after.q[1] + after.v[1])
-    lost = jnp.where(finite, np.int32(Flag.RUNAWAY), np.int32(Flag.NON_FINITE))
-    reason = jnp.where(going & within & finite, np.int32(Flag.OVERFLOW), lost)
+    stopped, ended = failures.is_stopped(loop.flag), motion.passed >= settings.steps
+    outlook = failures.look_ahead(plant, motion.v, motion.seen.acceleration, dt)
+    going = ~stopped & ~ended & outlook.possible
+    after, reached = iterate(system, integrator, failures.safe(going, motion), dt)
+    within, lost = failures.verdict(plant, plants.state_of(plant, after.q, after.v), outlook)
+    good = going & within & (left > settings.steps - after.passed)
+    reason = jnp.where(going & within, np.int32(Flag.OVERFLOW), lost)
     chatter = jnp.where(good & (after.crossings >= CHATTER_LENGTH), np.int32(Flag.CHATTERING), np.int32(0))
     flag = loop.flag | jnp.where(stopped | ended | good, np.int32(0), reason) | chatter
     # A run that is held passes one grid point an iteration.
-    held = motion._replace(
+    on_hold = motion._replace(
         passed=motion.passed + (~ended).astype(motion.passed.dtype),
         offset=jnp.zeros_like(motion.offset),
         elapsed=jnp.where(ended, motion.elapsed, 0.0),
         stage=jnp.full_like(motion.stage, RUN),
     )
-    motion = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, held)
-    return loop._replace(motion=motion, flag=flag), (good & reached) | (~good & ~ended)
+    before = motion.passed
+    motion = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, on_hold)
+    loop = loop._replace(motion=motion, flag=flag)
+    if held:
+        instant = (motion.passed != before) & (motion.passed % settings.steps_per_control == 0)
+        loop = _control(plant, controller, system, loop, instant, settings)
+    return loop, (good & reached) | (~good & ~ended)
+
+
+def _control(
+    plant: Plant, controller: Any, system: System, loop: _Loop, instant: jax.Array, settings: Settings
+) -> _Loop:
+    """Reads the controller on the sampled clock, if this is a control instant."""
+    motion, mode = loop.motion, loop.motion.mode
+    state = plants.state_of(plant, motion.q, motion.v)
+    memory, given = update_controller(plant, controller, loop.memory, state, settings)
+    changes = jnp.where(mode_of(memory) != mode_of(loop.memory), loop.changes + 1, 0)
+    mode = mode._replace(u=given.applied)
+    seen, slopes = observe(system, motion.q, motion.v, mode)
+    new = (memory, changes, motion._replace(mode=mode, seen=seen, slopes=slopes))
+    old = (loop.memory, loop.changes, motion)
+    memory, changes, motion = jax.tree.map(lambda x, y: jnp.where(instant, x, y), new, old)
+    chatter = jnp.where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
+    return loop._replace(motion=motion, memory=memory, changes=changes, flag=loop.flag | chatter)

@@ -16,7 +16,6 @@ from cpjax.numeric.extremes import larger, smaller
 from cpjax.numeric.trigonometry import sin_cos, wrap_angle
 from cpjax.pytree import Scalar, number, pytree
 from cpjax.sim.flags import STOPPED
-from cpjax.state import State
 
 
 class Sample(NamedTuple):
@@ -26,9 +25,10 @@ class Sample(NamedTuple):
     """[s]."""
     elapsed: jax.Array
     """Since the sample before [s]; 0 at the first, and after a flag has stopped the run."""
-    state: State
+    state: Any
+    """The plant's state."""
     voltage: jax.Array
-    """Applied from now on, clipped [V]."""
+    """The input applied from now on, clipped [V]."""
     voltage_since: jax.Array
     """Applied right after the sample before [V]; at the first sample `voltage`."""
     voltage_until: jax.Array | None
@@ -38,12 +38,15 @@ class Sample(NamedTuple):
     """From now on."""
     mode_before: jax.Array
     """Until now, since the sample before."""
-    cart_acceleration: jax.Array
-    """x'' from now on [m/s^2]."""
+    outputs: dict[str, jax.Array]
+    """What the plant wants kept beside state and input, from now on; of a `CartPole`, `cart_acceleration` [m/s^2]."""
+    plant_mode: Any
+    """The plant's own mode from now on; () for a plant without modes."""
     flag: jax.Array
     """Bits of `Flag`."""
     crossing: jax.Array
-    """What was located here, int32: 0 nothing, 1 and 2 the upper and the lower end of the supply, 3 the gate."""
+    """What was located here, int32: 0 nothing, 1 and 2 the upper and the lower end of the supply, 3 the gate; events of
+    the plant's own from 4 on, or from 1 on on the sampled clock."""
     crossing_speed: jax.Array
     """How fast that guard fell [1/s]: of the voltage relative to the limit, or of the gate's margin. 0 elsewhere."""
 
@@ -52,9 +55,10 @@ class Sample(NamedTuple):
         """Applied right before this sample [V], on either clock."""
         return self.voltage_since if self.voltage_until is None else self.voltage_until
 
-
-GATE_CROSSING = 3
-"""`Sample.crossing` at a located change of the controller's mode."""
+    @property
+    def cart_acceleration(self) -> jax.Array:
+        """x'' of a cart-pole from now on [m/s^2]."""
+        return self.outputs["cart_acceleration"]
 
 
 class Fold(Protocol):
@@ -71,6 +75,20 @@ class Fold(Protocol):
     def finish(self, memory: Any, last: Sample) -> Any:
         """The result."""
         ...
+
+
+@pytree
+class NoMetrics:
+    """The metric that keeps nothing; its result is None."""
+
+    def init(self, sample: Sample) -> tuple[()]:
+        return ()
+
+    def update(self, memory: tuple[()], sample: Sample) -> tuple[()]:
+        return ()
+
+    def finish(self, memory: tuple[()], last: Sample) -> None:
+        return None
 
 
 @pytree

@@ -1,27 +1,29 @@
-"""Closed-loop rollouts: from a plant, a controller and a start to a trajectory and its metrics.
+"""Closed-loop rollouts: from a plant, a controller and an initial state to a trajectory and its metrics.
 
-Everything here is for one start; batches are `jax.vmap` of it (`cpjax.sweep` does so). The work is done by one compiled
-scan: that of `per_step.py`, or that of `located.py`.
+Everything here is for one initial state; batches are `jax.vmap` of it (`cpjax.sweep` does so). The work is done by one
+compiled scan: that of `per_step.py`, or that of `located.py`.
 """
 
 import copy
 import functools
-from typing import Any
+from typing import Any, Unpack
 
 import jax
 import numpy as np
 
 from cpjax.controllers.feedback import StateFeedback
-from cpjax.controllers.protocol import Controller, Law, SmoothController, as_controller
+from cpjax.controllers.protocol import Controller, Law, ModalController, SmoothController, as_controller, at_period
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
-from cpjax.pytree import cast, check, pytree
+from cpjax.pytree import cast, check, hide, pytree, reveal
 from cpjax.sim import located, per_step
+from cpjax.sim.derivatives import may_switch, watched
 from cpjax.sim.flags import IN_DOUBT
+from cpjax.sim.initial import checked_initial
 from cpjax.sim.kept import Kept, fields, keep
-from cpjax.sim.metrics import Fold, ProtocolMetrics, Sample
-from cpjax.sim.settings import Checkpoint, Clock, Settings, Switching, check_settings
-from cpjax.state import State, checked_start
+from cpjax.sim.metrics import Fold, NoMetrics, ProtocolMetrics, Sample
+from cpjax.sim.plants import Eventful, Plant, Tree, check_plant
+from cpjax.sim.settings import Settings, Simulation, check_names, check_settings
 
 
 @pytree
@@ -30,120 +32,151 @@ class Trajectory:
 
     Attributes:
       time: (n,) [s].
-      state: State of (n,) arrays. theta is not wrapped.
+      state: the plant's state, of (n,) arrays; of a `CartPole` a `State`, whose theta is not wrapped.
       voltage: (n,) applied from that instant on, clipped [V].
-      mode: (n,) int32, from that instant on.
-      cart_acceleration: (n,) x'' from that instant on [m/s^2].
+      mode: (n,) int32, of the controller, from that instant on.
+      outputs: what the plant keeps beside these, by name, each (n,); of a `CartPole` `cart_acceleration`, x'' from that
+        instant on [m/s^2].
       flag: () int32, bits of `Flag` for the whole run; 0 is clean.
-      metrics: what the run's fold returned, over every step whether saved or not.
+      metrics: what the run's metric returned, over every step whether saved or not.
     """
 
     time: jax.Array
-    state: State
+    state: Any
     voltage: jax.Array
     mode: jax.Array
-    cart_acceleration: jax.Array
+    outputs: dict[str, jax.Array]
     flag: jax.Array
     metrics: Any
 
+    @property
+    def cart_acceleration(self) -> jax.Array:
+        """x'' of a cart-pole (n,), from that instant on [m/s^2]."""
+        return self.outputs["cart_acceleration"]
+
 
 def rollout(
-    plant: CartPole,
-    controller: Controller | Law,
-    start: State,
+    plant: Plant,
+    controller: Controller | ModalController | Law,
+    start: Tree,
     *,
-    duration: float,
-    dt: float,
-    clock: Clock = "continuous",
-    control_period: float | None = None,
-    switching: Switching = "per_step",
-    integrator: str = "rk4",
-    save_every: int = 1,
-    spare_steps: int | None = None,
-    checkpoint: Checkpoint = "segments",
     metrics: Fold | None = None,
+    **simulation: Unpack[Simulation],
 ) -> Trajectory:
-    """Simulates the closed loop from one start. Works under `jit`, `vmap` and differentiation.
+    """Simulates the closed loop from one initial state. Works under `jit`, `vmap` and differentiation.
 
-    The start's dtype is the rollout's: plant and controller are cast to it. Two calls that differ only in numbers
-    (start, gains, parameters, dt at an equal count of steps) share one compilation.
+    The initial state's dtype is the rollout's: plant and controller are cast to it. Two calls that differ only in
+    numbers (initial state, gains, parameters, dt at an equal count of steps) share one compilation.
 
     Args:
-      start: of scalars. For many starts, `cpjax.sweep` or `jax.vmap`.
-      duration: a whole number of steps [s].
-      dt: the integrator's step [s].
-      clock: "continuous" evaluates the law in every stage of the integrator; "sampled" evaluates law and gate once per
-        control period and holds the voltage (zero-order hold).
-      control_period: of the sampled clock, a whole number of steps [s]; by default one step.
-      switching: "per_step": the mode is read at the control instants and kept in between. "located", on the continuous
-        clock: changes of mode, and the moments at which the voltage reaches the limit or leaves it, are found inside
-        their steps, and first derivatives know that they move (see docs/gradients.md). In each mode the law has to be
-        continuous in the state; a StateFeedback alone is not, at theta = pi.
-      integrator: a key of `cpjax.sim.integrators.INTEGRATORS`.
-      save_every: keep every so many steps; must divide the number of steps.
-      spare_steps: of located switching, whose crossings take four steps each: the most that they may take together. A
-        run that needs more is stopped and flagged. By default 64 and a sixteenth of the steps.
-      checkpoint: what reverse mode remembers: the state at the ends of "segments" of about sqrt(n) steps, or at
-        "every_step", which takes more memory. Nothing else depends on it. (With switching per step, `rollout` remembers
-        the saved states, whatever is asked for, and `measure` after `cpjax.configure_cpu` always "segments".)
-      metrics: a fold over all steps; by default `ProtocolMetrics()`.
+      plant: a `CartPole`, or a plant of your own (see `cpjax.sim.plants.Plant`).
+      controller: a `Hybrid`, a law, or a controller with memory (see `cpjax.controllers.protocol`).
+      start: the initial state, of scalars. For many, `cpjax.sweep` or `jax.vmap`.
+      metrics: a metric, folded over all steps; by default `ProtocolMetrics()` for a `CartPole`, none for other plants.
+      simulation: see `cpjax.Simulation`: duration, dt, clock, control_period, switching, integrator, save_every,
+        spare_steps, checkpoint, derivative.
 
     Raises:
-      InputError: bad arguments, named; never because of what the simulation does (see `Trajectory.flag`).
+      InputError: bad arguments, named; a law, controller, plant or metric that returns what it should not; never
+        because of what the simulation does (see `Trajectory.flag`).
     """
+    check_names("rollout", simulation)
+    save_every = simulation.pop("save_every", 1)
     if save_every is None:
         raise InputError("save_every", save_every, "a whole number of steps, at least 1; cpjax.measure saves nothing")
-    settings = check_settings(
-        duration, dt, clock, control_period, switching, integrator, save_every, spare_steps, checkpoint
-    )
-    start, dtype = checked_start(start, "start", batched=False)
-    arguments, _ = cast_arguments(plant, controller, metrics, dt, dtype, settings)
+    start, arguments, settings, _ = prepared(plant, controller, start, metrics, save_every=save_every, **simulation)
     trajectory: Trajectory = _simulate(start, *arguments, settings=settings)
     return trajectory
 
 
 def measure(
-    plant: CartPole,
-    controller: Controller | Law,
-    start: State,
+    plant: Plant,
+    controller: Controller | ModalController | Law,
+    start: Tree,
     *,
-    duration: float,
-    dt: float,
-    clock: Clock = "continuous",
-    control_period: float | None = None,
-    switching: Switching = "per_step",
-    integrator: str = "rk4",
-    spare_steps: int | None = None,
-    checkpoint: Checkpoint = "segments",
     metrics: Fold | None = None,
+    **simulation: Unpack[Simulation],
 ) -> Any:
-    """What `rollout(...).metrics` would be, without storing a trajectory. Arguments and errors as for `rollout`."""
-    settings = check_settings(duration, dt, clock, control_period, switching, integrator, None, spare_steps, checkpoint)
-    start, dtype = checked_start(start, "start", batched=False)
-    arguments, _ = cast_arguments(plant, controller, metrics, dt, dtype, settings)
+    """Returns what `rollout(...).metrics` would be, without storing a trajectory. Arguments and errors as there."""
+    check_names("measure", simulation)
+    if "save_every" in simulation:
+        raise TypeError("measure() saves no trajectory and takes no save_every; cpjax.rollout does")
+    start, arguments, settings, _ = prepared(plant, controller, start, metrics, **simulation)
     return _simulate(start, *arguments, settings=settings)
 
 
+def prepared(
+    plant: Any, controller: Any, start: Any, metrics: Fold | None, *, batched: bool = False, **simulation: Any
+) -> tuple[Any, tuple[Plant, Any, Fold, Any], Settings, list[bool]]:
+    """Returns the arguments of `simulate`, checked and cast to the initial state's dtype.
+
+    Args:
+      batched: whether `start` holds many initial states, arrays of shape (n,).
+
+    Returns:
+      The initial state; plant, controller, metric and dt; the settings; and, for each leaf of these, whether it has an
+      axis of one entry for each initial state.
+
+    Raises:
+      InputError: as `rollout` does.
+    """
+    check_plant(plant)
+    settings = check_settings(**simulation, events=isinstance(plant, Eventful))
+    name = "starts" if batched else "start"
+    start, dtype, count = checked_initial(plant, start, name, batched=batched)
+    controller = _without_designs(as_controller(controller))
+    if settings.clock == "continuous" and not isinstance(controller, ModalController):
+        allowed = "sampled: a controller with memory is updated once per control period"
+        raise InputError("clock", settings.clock, allowed)
+    if settings.clock == "continuous" and settings.switching == "located":
+        if not isinstance(controller, SmoothController):
+            raise InputError("controller", controller, "one with margin and successor, for located switching")
+        if not hasattr(plant, "input_limit"):
+            raise InputError("plant", plant, "one with input_limit, for located switching on the continuous clock")
+    if metrics is None:
+        if not isinstance(plant, CartPole) and settings.save_every is None:
+            raise InputError("metrics", None, "given: the default ProtocolMetrics() are those of a cpjax.CartPole")
+        metrics = ProtocolMetrics() if isinstance(plant, CartPole) else NoMetrics()
+    folds = all(callable(getattr(metrics, name, None)) for name in ("init", "update", "finish"))
+    if isinstance(metrics, type) or not folds:
+        raise InputError("metrics", metrics, "a metric with init, update and finish, such as cpjax.ProtocolMetrics()")
+    parts: tuple[tuple[str, Any], ...] = (("plant", plant), ("controller", controller), ("metrics", metrics))
+    each = [leaf for name, part in parts for leaf in check(name, part, count)]
+    plant, controller, metrics = (hide(name, cast(part, dtype)) for name, part in parts)
+    dt = np.asarray(simulation["dt"], dtype=dtype)
+    return start, (plant, controller, metrics, dt), settings, [*each, False]
+
+
 @functools.partial(jax.jit, static_argnames="settings")
-def _simulate(start: State, plant: CartPole, controller: Any, fold: Fold, dt: jax.Array, *, settings: Settings) -> Any:
+def _simulate(start: Tree, plant: Plant, controller: Any, fold: Fold, dt: jax.Array, *, settings: Settings) -> Any:
     return results(*simulate(start, plant, controller, fold, dt, settings))
 
 
 def simulate(
-    start: State, plant: CartPole, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
+    start: Tree, plant: Any, controller: Any, fold: Any, dt: jax.Array, settings: Settings
 ) -> tuple[Kept | None, Sample, Any]:
-    """Of arguments that have been checked and cast: what is kept of all samples but the last (None if nothing is), the
-    last one (its flag may have IN_DOUBT), and what the fold made of all of them."""
+    """Simulates one initial state; arguments as `prepared` returns them.
+
+    Returns:
+      The saved samples but for the last (None if nothing is saved), the last one (its flag may have IN_DOUBT), and the
+      metric's result.
+    """
+    plant, controller, fold = reveal((plant, controller, fold))
+    if settings.clock == "sampled":
+        controller = at_period(controller, dt * settings.steps_per_control)
+    blind = settings.switching == "per_step" or settings.clock == "sampled"
+    if blind and settings.derivative is None and may_switch(controller):
+        start, plant, controller = watched((start, plant, controller))
     one = located.simulate if settings.switching == "located" else per_step.simulate
     packed, last, result = one(start, plant, controller, fold, dt, settings)
-    return (None if packed is None else keep(packed, plant)), last, result
+    return (None if packed is None else keep(packed, plant, last)), last, result
 
 
 def results(kept: Kept | None, last: Sample, result: Any) -> Any:
-    """What users get of what `simulate` returned: a `Trajectory`, or only what the fold made of it."""
+    """Returns what users get of what `simulate` returned: a `Trajectory`, or only the metric's result."""
     if kept is None:
         return result
-    return Trajectory(**fields(kept, last), flag=last.flag & ~IN_DOUBT, metrics=result)  # type: ignore[arg-type]  # of a dict
+    return Trajectory(**fields(kept, last), flag=last.flag & ~IN_DOUBT, metrics=result)
 
 
 def _without_designs(controller: Any) -> Any:
@@ -158,25 +191,3 @@ def _without_designs(controller: Any) -> Any:
         return law
 
     return jax.tree.map(bare, controller, is_leaf=lambda part: isinstance(part, StateFeedback))
-
-
-def cast_arguments(
-    plant: Any, controller: Any, fold: Fold | None, dt: float, dtype: Any, settings: Settings, batch: int | None = None
-) -> tuple[tuple[CartPole, Controller, Fold, Any], list[bool]]:
-    """What `simulate` takes after the start, and for each of its leaves whether it has an axis of length `batch`.
-
-    Raises:
-      InputError: as `rollout` does.
-    """
-    if not isinstance(plant, CartPole):
-        raise InputError("plant", plant, "a cpjax.CartPole")
-    fold = ProtocolMetrics() if fold is None else fold
-    if isinstance(fold, type) or not all(callable(getattr(fold, name, None)) for name in ("init", "update", "finish")):
-        raise InputError("metrics", fold, "a fold, such as cpjax.ProtocolMetrics()")
-    controller = _without_designs(as_controller(controller))
-    if settings.switching == "located" and not isinstance(controller, SmoothController):
-        raise InputError("controller", controller, "one with margin and successor, for located switching")
-    parts = (("plant", plant), ("controller", controller), ("metrics", fold))
-    batched = [leaf for name, part in parts for leaf in check(name, part, batch)]
-    arguments = cast(plant, dtype), cast(controller, dtype), cast(fold, dtype), np.asarray(dt, dtype=dtype)
-    return arguments, [*batched, False]

@@ -1,7 +1,7 @@
-"""How a rollout is to be computed: what a compilation depends on, beside structures and dtypes."""
+"""How a rollout is computed: the one declaration of what `rollout`, `measure`, `sweep` and `record_sweep` share."""
 
 import math
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Literal, NamedTuple, Required, TypeAlias, TypedDict, cast, get_args
 
 from cpjax.errors import InputError
 from cpjax.pytree import is_traced
@@ -10,10 +10,51 @@ from cpjax.sim.integrators import INTEGRATORS
 Clock: TypeAlias = Literal["continuous", "sampled"]
 Switching: TypeAlias = Literal["per_step", "located"]
 Checkpoint: TypeAlias = Literal["every_step", "segments"]
+Derivative: TypeAlias = Literal["pathwise", "mean"]
+
+
+class Simulation(TypedDict, total=False):
+    """The keyword arguments that say how a rollout is computed.
+
+    Attributes:
+      duration: a whole number of steps [s]. Required.
+      dt: the integrator's step [s]. Required.
+      clock: "sampled" evaluates the controller once per control period and holds its command (zero-order hold), as
+        firmware does; "continuous" evaluates the law in every stage of the integrator, and takes no controller with a
+        memory of its own. By default "sampled", or "continuous" where located switching is asked for.
+      control_period: of the sampled clock, a whole number of steps [s]; by default one step.
+      switching: "per_step", the default: the mode is read at the control instants and kept in between. "located", on
+        the continuous clock: changes of mode, and the moments at which the voltage reaches the limit or leaves it, are
+        found inside their steps, and derivatives know that they move (see docs/gradients.md). In each mode the law has
+        to be continuous in the state; a StateFeedback alone is not, at theta = pi. The events of a plant that has some
+        (`cpjax.sim.plants.Eventful`) are located on either clock.
+      integrator: a key of `cpjax.sim.integrators.INTEGRATORS`; "rk4" by default.
+      save_every: keep every so many steps; has to divide their number. None keeps no trajectory. `rollout` keeps all by
+        default, `sweep` none; `measure` does not take it.
+      spare_steps: of located events, each of which takes four steps: the most that they may take together. A run that
+        needs more is stopped and flagged. By default 64 and a sixteenth of the steps.
+      checkpoint: what reverse mode remembers: the state at the ends of "segments" of about sqrt(n) steps, or at
+        "every_step", which takes more memory. Nothing else depends on it. (With switching per step, `rollout` remembers
+        the saved states, whatever is asked for, and `measure` after `cpjax.configure_cpu` always "segments".)
+      derivative: where the moment of a change of mode does not move with the parameters, because it falls on a control
+        instant, "pathwise" leaves its effect out; "mean", on the sampled clock, adds it: the result is the derivative
+        of the mean over initial states (see docs/gradients.md). Without either, differentiating such a loop warns.
+    """
+
+    duration: Required[float]
+    dt: Required[float]
+    clock: Clock | None
+    control_period: float | None
+    switching: Switching | None
+    integrator: str
+    save_every: int | None
+    spare_steps: int | None
+    checkpoint: Checkpoint
+    derivative: Derivative | None
 
 
 class Settings(NamedTuple):
-    """See `cpjax.rollout`, whose arguments these are."""
+    """What a compilation depends on, beside structures and dtypes; see `Simulation`."""
 
     steps: int
     save_every: int | None
@@ -25,23 +66,45 @@ class Settings(NamedTuple):
     """Beyond `steps`, for crossings; 0 where none are located."""
     integrator: str
     checkpoint: Checkpoint
+    derivative: Derivative | None
     optimistic: bool = False
-    """Values only: held steps by `step_held_by_turns`, and no run is held where it goes wrong. A start for which that
-    was not right has the flag `IN_DOUBT`, and all else about it means nothing."""
+    """Values only: held steps by `step_held_incremental`, and no run is held where it goes wrong. A start for which
+    that was not right has the flag `IN_DOUBT`, and all else about it means nothing."""
+
+
+def check_names(function: str, simulation: Any) -> None:
+    """Checks the names of keyword arguments, as Python does for those that a function declares itself.
+
+    Raises:
+      TypeError: a name that `Simulation` does not have, or one of its required names is missing.
+    """
+    for name in simulation:
+        if name not in Simulation.__annotations__:
+            known = ", ".join(Simulation.__annotations__)
+            raise TypeError(f"{function}() got an unexpected keyword argument {name!r}; it takes {known}")
+    for name in Simulation.__required_keys__:
+        if name not in simulation:
+            raise TypeError(f"{function}() missing 1 required keyword-only argument: {name!r}")
 
 
 def check_settings(
+    *,
     duration: Any,
     dt: Any,
-    clock: Clock,
-    control_period: Any,
-    switching: Switching,
-    integrator: Any,
-    save_every: Any,
+    clock: Any = None,
+    control_period: Any = None,
+    switching: Any = None,
+    integrator: Any = "rk4",
+    save_every: Any = None,
     spare_steps: Any = None,
-    checkpoint: Checkpoint = "segments",
+    checkpoint: Any = "segments",
+    derivative: Any = None,
+    events: bool = False,
 ) -> Settings:
-    """The settings of a rollout; `save_every` None for metrics only.
+    """Returns the settings of a rollout; `save_every` None for metrics only.
+
+    Args:
+      events: whether the plant has events of its own, which are located on either clock.
 
     Raises:
       InputError: as `rollout` does.
@@ -51,13 +114,17 @@ def check_settings(
     if dt > duration:
         raise InputError("dt", dt, f"at most the duration, {duration:g} s")
     steps = _whole_steps("duration", duration, dt)
-    if not isinstance(clock, str) or clock not in get_args(Clock):
-        raise InputError("clock", clock, "continuous or sampled")
-    if not isinstance(switching, str) or switching not in get_args(Switching):
-        raise InputError("switching", switching, "per_step or located")
-    if switching == "located" and clock != "continuous":
+    _check_choice("switching", switching, Switching)
+    _check_choice("clock", clock, Clock)
+    if clock is None:
+        clock = "continuous" if switching == "located" else "sampled"
+    if switching is None:
+        switching = "located" if events else "per_step"
+    if switching == "located" and clock != "continuous" and not events:
         allowed = "per_step on the sampled clock: a held control changes mode only at its samples"
         raise InputError("switching", switching, allowed)
+    if switching == "per_step" and events:
+        raise InputError("switching", switching, "located, or absent, for a plant with events of its own")
     if spare_steps is None:
         spare_steps = 64 + steps // 16 if switching == "located" else 0
     elif switching != "located":
@@ -66,6 +133,10 @@ def check_settings(
         raise InputError("spare_steps", spare_steps, "a whole number of steps, at least 0")
     if not isinstance(checkpoint, str) or checkpoint not in get_args(Checkpoint):
         raise InputError("checkpoint", checkpoint, "every_step or segments")
+    _check_choice("derivative", derivative, Derivative)
+    if derivative == "mean" and clock != "sampled":
+        allowed = "pathwise, or absent, on the continuous clock: there, locate the switch (switching = located)"
+        raise InputError("derivative", derivative, allowed)
     if not isinstance(integrator, str) or integrator not in INTEGRATORS:
         raise InputError("integrator", integrator, "one of " + ", ".join(INTEGRATORS))
     steps_per_control = 1
@@ -81,7 +152,22 @@ def check_settings(
             raise InputError("save_every", save_every, "a whole number of steps, at least 1")
         if steps % save_every:
             raise InputError("save_every", save_every, f"a divisor of the number of steps, {steps}")
-    return Settings(steps, save_every, clock, steps_per_control, switching, spare_steps, integrator, checkpoint)
+    return Settings(
+        steps=steps,
+        save_every=save_every,
+        clock=clock,
+        steps_per_control=steps_per_control,
+        switching=switching,
+        spare_steps=spare_steps,
+        integrator=integrator,
+        checkpoint=cast(Checkpoint, checkpoint),
+        derivative=derivative,
+    )
+
+
+def _check_choice(field: str, value: Any, choices: Any) -> None:
+    if value is not None and (not isinstance(value, str) or value not in get_args(choices)):
+        raise InputError(field, value, " or ".join(get_args(choices)))
 
 
 def _positive_seconds(field: str, value: Any) -> float:
@@ -98,7 +184,7 @@ def _positive_seconds(field: str, value: Any) -> float:
 
 
 def _whole_steps(field: str, seconds: float, dt: float) -> int:
-    """How many steps of `dt` make `seconds`; decimal fractions such as 0.3 / 0.1 count as whole."""
+    """Returns how many steps of `dt` make `seconds`; decimal fractions such as 0.3 / 0.1 count as whole."""
     if not seconds / dt < 2**31:
         raise InputError(field, seconds, f"fewer than 2^31 steps of dt = {dt:g} s")
     steps = round(seconds / dt)

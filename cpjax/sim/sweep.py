@@ -9,7 +9,7 @@ What is computed for a start does not depend on any of this.
 import functools
 import math
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -18,16 +18,15 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from cpjax import runtime
-from cpjax.controllers.protocol import Controller, Law
+from cpjax.controllers.protocol import Controller, Law, ModalController
 from cpjax.errors import InputError
-from cpjax.plant import CartPole
 from cpjax.pytree import is_traced
 from cpjax.sim.flags import IN_DOUBT
 from cpjax.sim.kept import Kept
 from cpjax.sim.metrics import Fold, Sample
-from cpjax.sim.rollout import cast_arguments, results, simulate
-from cpjax.sim.settings import Checkpoint, Clock, Settings, Switching, check_settings
-from cpjax.state import State, checked_start
+from cpjax.sim.plants import Plant, Tree
+from cpjax.sim.rollout import prepared, results, simulate
+from cpjax.sim.settings import Settings, Simulation, check_names
 
 Progress = Callable[[int, int], None]
 """Called with the number of starts done and their total."""
@@ -54,66 +53,44 @@ _EVERYWHERE: Any = PartitionSpec()  # type: ignore[no-untyped-call]
 
 
 def sweep(
-    plant: CartPole,
-    controller: Controller | Law,
-    starts: State,
+    plant: Plant,
+    controller: Controller | ModalController | Law,
+    starts: Tree,
     *,
-    duration: float,
-    dt: float,
-    clock: Clock = "continuous",
-    control_period: float | None = None,
-    switching: Switching = "per_step",
-    integrator: str = "rk4",
-    save_every: int | None = None,
-    spare_steps: int | None = None,
-    checkpoint: Checkpoint = "segments",
     metrics: Fold | None = None,
     chunk: int | None = None,
     block: int | None = None,
     progress: Progress | None = None,
+    **simulation: Unpack[Simulation],
 ) -> Any:
-    """The metrics of every start, or their trajectories; see `rollout` for the arguments that are not described here.
+    """Returns the metrics of every initial state, or their trajectories; see `rollout` for the other arguments.
 
     Results are those of `rollout` to rounding. With several processes (`jax.distributed`), each calls this with the
     same arguments and gets the whole result.
 
     Args:
-      plant: one for all starts, or one for each: any of its numbers may be an array of shape (n,).
+      plant: one for all initial states, or one for each: any of its declared numbers may be an array of shape (n,).
       controller: likewise; a gain may have shape (n, 1, 4). So may `metrics`.
-      starts: a State of arrays of shape (n,), any n.
-      save_every: None stores nothing of the trajectories; k keeps every k-th step, for all n starts, in memory
-        (`cpjax.record_sweep` writes them to disk as they come).
-      chunk: starts that one device simulates together, at most; None for what suits the machine.
-      block: starts computed between two calls of `progress`, at most; None for about a second's work of a CPU.
-      progress: called after each block of starts.
+      starts: the initial states: a `State` of arrays of shape (n,), any n, or the state of a plant of your own.
+      chunk: initial states that one device simulates together, at most; None for what suits the machine.
+      block: initial states computed between two calls of `progress`, at most; None for about a second's work of a CPU.
+      progress: called after each block.
+      simulation: see `cpjax.Simulation`. `save_every` None stores nothing of the trajectories; k keeps every k-th step,
+        for all n initial states, in memory (`cpjax.record_sweep` writes them to disk as they come).
 
     Returns:
-      What `metrics` returns for one start, with a leading axis n; `Metrics` by default. With `save_every`, a
-      `Trajectory` of such arrays. Under `jit` or differentiation, by plain `vmap`.
+      What `metrics` returns for one initial state, with a leading axis n; `Metrics` by default. With `save_every`, a
+      `Trajectory` of such arrays. Under `jit` or differentiation, the same by plain `vmap` of `measure` or `rollout`.
 
     Raises:
       InputError: as for `rollout`, and for `chunk` or `block` below 1.
     """
-    work = prepare(
-        plant,
-        controller,
-        starts,
-        duration=duration,
-        dt=dt,
-        clock=clock,
-        control_period=control_period,
-        switching=switching,
-        integrator=integrator,
-        save_every=save_every,
-        spare_steps=spare_steps,
-        checkpoint=checkpoint,
-        metrics=metrics,
-        chunk=chunk,
-        block=block,
-    )
-    if any(is_traced(leaf) for leaf in work.leaves):
+    check_names("sweep", simulation)
+    work = prepare(plant, controller, starts, metrics=metrics, chunk=chunk, block=block, **simulation)
+    if work.traced:
         columns, shared = _split(work.leaves, work.kind.batched)
-        return jax.vmap(lambda column: results(*_one(column, shared, work.kind)))(columns)
+        kind = work.kind._replace(settings=work.kind.settings._replace(optimistic=False))
+        return jax.vmap(lambda column: results(*_one(column, shared, kind)))(columns)
     whole: Any = None
     for begin, part in zip(work.begins(), work.blocks(work.begins()), strict=True):
         if whole is None:
@@ -145,6 +122,18 @@ class Work(NamedTuple):
     total: int
     size: int
     """Starts of a block; the last one is filled up with copies of the last start."""
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the initial state's components, whose leaves come first."""
+        starts, _ = jax.tree.unflatten(self.kind.structure, self.leaves)
+        paths = jax.tree_util.tree_leaves_with_path(starts)
+        return [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths]
+
+    @property
+    def traced(self) -> bool:
+        """Whether JAX is tracing any of the numbers that go in."""
+        return any(is_traced(leaf) for leaf in self.leaves)
 
     def begins(self) -> range:
         """Where the blocks begin."""
@@ -202,39 +191,28 @@ class Work(NamedTuple):
 
 
 def prepare(
-    plant: CartPole,
-    controller: Controller | Law,
-    starts: State,
+    plant: Plant,
+    controller: Controller | ModalController | Law,
+    starts: Tree,
     *,
     metrics: Fold | None,
     chunk: int | None,
     block: int | None,
-    duration: float,
-    dt: float,
-    clock: Clock = "continuous",
-    control_period: float | None = None,
-    switching: Switching = "per_step",
-    integrator: str = "rk4",
-    save_every: int | None = None,
-    spare_steps: int | None = None,
-    checkpoint: Checkpoint = "segments",
+    **simulation: Any,
 ) -> Work:
-    """Checks a sweep's arguments and divides its starts into blocks; arguments and errors of `sweep`."""
+    """Checks a sweep's arguments and divides its initial states into blocks; arguments and errors of `sweep`."""
     for name, value in (("chunk", chunk), ("block", block)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
             raise InputError(name, value, "a whole number of starts, at least 1")
-    settings = check_settings(
-        duration, dt, clock, control_period, switching, integrator, save_every, spare_steps, checkpoint
-    )
-    settings = settings._replace(optimistic=clock == "sampled")
-    starts, dtype = checked_start(starts, "starts", batched=True)
-    total = int(jnp.shape(starts.x)[0])
-    arguments, batched = cast_arguments(plant, controller, metrics, dt, dtype, settings, batch=total)
+    starts, arguments, settings, batched = prepared(plant, controller, starts, metrics, batched=True, **simulation)
+    settings = settings._replace(optimistic=settings.clock == "sampled" and settings.switching == "per_step")
     leaves, structure = jax.tree.flatten((starts, arguments))
+    columns = jax.tree.leaves(starts)
+    total, dtype = columns[0].shape[0], columns[0].dtype
     devices = jax.devices()
     lanes, size = _sizes(total, devices, settings, np.dtype(dtype).itemsize, chunk, block)
     mesh = Mesh(np.array(devices), (_AXIS,))
-    kind = _Kind(structure, (True,) * 4 + tuple(batched), settings, lanes, mesh)
+    kind = _Kind(structure, (True,) * len(columns) + tuple(batched), settings, lanes, mesh)
     return Work(kind, leaves, total, size)
 
 

@@ -95,7 +95,7 @@ class Motion(NamedTuple):
 
 def start_motion(system: System, q: Tree, v: Tree, mode: Tree, dt: jax.Array) -> Motion:
     """At the first grid point."""
-    seen, slopes = _observe(system, q, v, mode)
+    seen, slopes = observe(system, q, v, mode)
     none = jnp.zeros_like(dt, dtype=jnp.int32)
     return Motion(q, v, mode, seen, slopes, none, 0.0 * dt, dt, 0.0 * dt, none + RUN, none, dt, none)
 
@@ -109,7 +109,7 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Arra
     q, v = integrator(
         lambda q, v: system.observe(q, v, motion.mode).acceleration, motion.q, motion.v, step, seen.acceleration
     )
-    ahead, slopes = _observe(system, q, v, motion.mode)
+    ahead, slopes = observe(system, q, v, motion.mode)
     landed, locating = stage == LANDED, stage >= 1
 
     # Newton's correction, unless it goes too far to be one: then the cubic was not like the guard.
@@ -179,7 +179,8 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Arra
     )
 
 
-def _observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, Guards]:
+def observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, Guards]:
+    """Returns the system's observation, and how fast its guards change, without a derivative."""
     seen = system.observe(q, v, mode)
     rates = lax.stop_gradient((v, seen.acceleration))
     guards = lambda q, v: system.observe(q, v, mode).guards  # noqa: E731

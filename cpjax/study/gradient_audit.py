@@ -23,10 +23,11 @@ from cpjax.numeric.differences import Differences, central_differences
 from cpjax.plant import CartPole
 from cpjax.pytree import is_traced
 from cpjax.sim.flags import STOPPED, describe
+from cpjax.sim.initial import checked_initial
 from cpjax.sim.metrics import Fold, TimeOutside
 from cpjax.sim.rollout import measure
 from cpjax.sim.settings import check_settings
-from cpjax.state import NAMES, State, checked_start
+from cpjax.state import NAMES, State
 from cpjax.study.gradient_probe import Probe, Prober
 from cpjax.study.named_parameters import Build, Numbers, as_matrix, as_tree, whole_changes
 
@@ -182,8 +183,8 @@ def audit_gradients(
     Raises:
       InputError: arguments that no rollout takes, or a controller that is not a Hybrid.
     """
-    starts, dtype = checked_start(starts, "starts", batched=True)
-    check_settings(duration, dt, "continuous", None, "located", "rk4", None)
+    starts, dtype, _ = checked_initial(CartPole(), starts, "starts", batched=True)
+    check_settings(duration=duration, dt=dt, switching="located")
     if dtype != jnp.float64:
         raise InputError("starts", f"State of {dtype}", "of float64: float32 has too few digits for differences")
     ends = _horizons(horizons, duration, dt)
@@ -211,9 +212,10 @@ def audit_gradients(
             limit = plant.motor.voltage_limit
             if is_traced(limit) or np.isfinite(limit):
                 law = SmoothClip(law, limit, temperature * limit)
-        found: tuple[Probe, jax.Array] = measure(
-            plant, law, start, duration=duration, dt=dt, switching=switching, metrics=fold
-        )
+        how: dict[str, Any] = {"duration": duration, "dt": dt, "clock": "continuous", "switching": switching}
+        if switching == "per_step":
+            how["derivative"] = "pathwise"  # what the audit is there to show
+        found: tuple[Probe, jax.Array] = measure(plant, law, start, metrics=fold, **how)
         return found
 
     def jacobians(switching: Any, arguments: tuple[int, ...]) -> Any:

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from cpjax.pytree import part, pytree
-from cpjax.sim.metrics import GATE_CROSSING, Fold, Sample
+from cpjax.sim.closed_loop import GATE_CROSSING
+from cpjax.sim.metrics import Fold, Sample
 
 
 class Probe(NamedTuple):

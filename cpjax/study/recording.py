@@ -5,19 +5,19 @@ import io as buffers
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
 from cpjax import io
-from cpjax.controllers.protocol import Controller, Law, as_controller
+from cpjax.controllers.protocol import Controller, Law, ModalController, as_controller
 from cpjax.errors import InputError
-from cpjax.plant import CartPole
 from cpjax.sim.metrics import Fold, ProtocolMetrics
+from cpjax.sim.plants import Plant
+from cpjax.sim.settings import Simulation, check_names
 from cpjax.sim.sweep import Progress, Work, prepare
-from cpjax.state import NAMES, State
 
 SUFFIXES = (".parquet", ".npz", ".json")
 """Of the files that a sweep's metrics are written to."""
@@ -27,21 +27,18 @@ _DOCUMENT = "cpjax"  # under which an NPZ or Parquet file holds the document
 
 def record_sweep(
     path: str | Path,
-    plant: CartPole,
-    controller: Controller | Law,
-    starts: State,
+    plant: Plant,
+    controller: Controller | ModalController | Law,
+    starts: Any,
     *,
-    duration: float,
-    dt: float,
     metrics: Fold | None = None,
-    save_every: int | None = None,
     about: Mapping[str, Any] | None = None,
     chunk: int | None = None,
     block: int | None = None,
     progress: Progress | None = None,
-    **settings: Any,
+    **simulation: Unpack[Simulation],
 ) -> Any:
-    """A `cpjax.sweep` whose results go to `path`, with plant, controller, settings and versions beside them.
+    """Runs a `cpjax.sweep` whose results go to `path`, with plant, controller, settings and versions beside them.
 
     Each block is saved when it is done, in the folder `path` + ".parts". Killed at any moment and called again with
     the same arguments, it goes on there and ends in the identical file; the folder is then gone. With several processes
@@ -51,7 +48,7 @@ def record_sweep(
       path: ends in .parquet (needs pyarrow), .npz or .json. With `save_every`, the name of a folder without a suffix,
         in which the blocks of trajectories stay, each an NPZ file, beside sweep.json.
       about: plain values to keep in the file, such as the seed of the starts.
-      settings: as for `sweep`, which describes the other arguments too.
+      simulation: see `cpjax.Simulation`; `sweep` describes the other arguments too.
 
     Returns:
       What `sweep` would return, as NumPy arrays; None for trajectories, and in all processes but the first.
@@ -59,20 +56,24 @@ def record_sweep(
     Raises:
       InputError: as for `sweep`; another suffix; or a folder of parts that belongs to another sweep.
     """
+    check_names("record_sweep", simulation)
+    save_every = simulation.get("save_every")
     path = _checked_path(path, trajectories=save_every is not None)
-    fold = ProtocolMetrics() if metrics is None else metrics
-    chosen: dict[str, Any] = {"duration": duration, "dt": dt, "save_every": save_every, **settings}
-    work = prepare(plant, controller, starts, metrics=fold, chunk=chunk, block=block, **chosen)
+    work = prepare(plant, controller, starts, metrics=metrics, chunk=chunk, block=block, **simulation)
+    if work.traced:
+        raise InputError("record_sweep", "traced arguments", "outside jit, vmap and grad: it writes files")
+    # Results of 0.1 name the clock; a result without one would be of the continuous clock, the default then.
+    run = {**simulation, "clock": work.kind.settings.clock}
     document = {
         "what": "closed-loop trajectories of many starts" if save_every else "metrics of many closed-loop runs",
         "versions": io.versions(),
         "about": dict(about or {}),
-        "run": {key: value for key, value in chosen.items() if value is not None},
+        "run": {key: value for key, value in run.items() if value is not None},
         "count": work.total,
         "dtype": str(work.leaves[0].dtype),
-        "plant": io.encode(plant),
+        "plant": _described(plant),
         "controller": _described(as_controller(controller)),
-        "metrics": _described(fold),
+        "metrics": _described(ProtocolMetrics() if metrics is None else metrics),
     }
     folder = path if save_every else path.with_name(path.name + ".parts")
     first = jax.process_index() == 0
@@ -155,13 +156,16 @@ def _digest(work: Work) -> str:
 
 
 def _starts(work: Work, begin: int, end: int) -> dict[str, np.ndarray]:
-    columns = zip(NAMES, work.leaves, strict=False)  # the start's leaves come first
+    columns = zip(work.names, work.leaves, strict=False)  # the initial state's leaves come first
     return {f"start.{name}": np.asarray(column)[begin:end] for name, column in columns}
 
 
 def _columns(result: Any) -> dict[str, np.ndarray]:
-    leaves = jax.tree_util.tree_leaves_with_path(result)
-    return {jax.tree_util.keystr(key, simple=True, separator=".") or "result": leaf for key, leaf in leaves}
+    columns = {}
+    for path, leaf in jax.tree_util.tree_leaves_with_path(result):
+        name = jax.tree_util.keystr(path, simple=True, separator=".") or "result"
+        columns[name.removeprefix("outputs.")] = leaf  # of a trajectory, beside its other columns
+    return columns
 
 
 def _npz(columns: Mapping[str, Any]) -> bytes:

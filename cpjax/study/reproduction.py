@@ -49,7 +49,7 @@ class Setting:
     dt: float = 0.002
 
     def __post_init__(self) -> None:
-        check_settings(self.duration, self.dt, "sampled", None, "per_step", "rk4", None)
+        check_settings(duration=self.duration, dt=self.dt)
         check_starts(self.starts, self.count, self.seed)
 
 

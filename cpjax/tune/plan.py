@@ -142,7 +142,7 @@ def check_plan(
         object.__setattr__(plan, name, rule.normalise(name, getattr(plan, name)))
     for whole, part in steps:
         try:
-            check_settings(getattr(plan, whole), getattr(plan, part), "continuous", None, "per_step", "rk4", None)
+            check_settings(duration=getattr(plan, whole), dt=getattr(plan, part))
         except InputError as problem:
             field = part if problem.field == "dt" else whole
             raise InputError(field, getattr(plan, field), problem.allowed) from problem

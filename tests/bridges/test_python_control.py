@@ -94,7 +94,7 @@ class Constant:
 def test_the_plant_under_a_constant_voltage_is_a_rollout():
     times = np.linspace(0.0, 2.0, 101)
     states, _ = simulate(bridge.plant_system(ROUGH), times, columns(HANGING), np.full(101, 3.0), **TIGHT)
-    run = cpjax.rollout(ROUGH, Constant(), HANGING, duration=2.0, dt=2e-4, save_every=100)
+    run = cpjax.rollout(ROUGH, Constant(), HANGING, clock="continuous", duration=2.0, dt=2e-4, save_every=100)
     assert np.max(np.abs(states - columns(run.state))) <= 1e-11
 
 
@@ -209,7 +209,9 @@ def test_without_a_clip_the_continuous_loop_is_the_rollout_before_and_after_a_ca
     system = bridge.closed_loop_system(plant, controller)
     steps, every = 8192, 256
     dt = (catch_time(system, columns(LEANING), 2.0) + 1e-10) / steps
-    run = cpjax.rollout(plant, controller, LEANING, duration=2 * steps * dt, dt=dt, save_every=every)
+    run = cpjax.rollout(
+        plant, controller, LEANING, clock="continuous", duration=2 * steps * dt, dt=dt, save_every=every
+    )
     catch = int(np.argmax(run.mode))
     assert (catch, int(run.metrics.switches)) == (steps // every, 1)
     states, outputs = simulate(system, np.asarray(run.time), columns(LEANING), **TIGHT)
@@ -227,7 +229,7 @@ def test_without_a_clip_the_continuous_loop_is_the_rollout_before_and_after_a_ca
 )
 def test_with_the_clip_the_continuous_loop_is_the_rollout_in_either_mode(plant, start, mode):
     controller = hybrid(plant)
-    run = cpjax.rollout(plant, controller, start, duration=0.8, dt=1e-4, save_every=200)
+    run = cpjax.rollout(plant, controller, start, clock="continuous", duration=0.8, dt=1e-4, save_every=200)
     assert np.any(np.abs(run.voltage) == 12.0)
     assert np.any(np.abs(run.voltage) < 12.0)
     states, outputs = simulate(
@@ -243,7 +245,7 @@ def test_with_the_clip_the_continuous_loop_is_the_rollout_in_either_mode(plant, 
 def test_a_law_on_its_own_closes_the_loop_in_mode_0():
     plant, start = ROUGH, State(0.1, 0.0, 0.1, 0.0)
     law = StateFeedback(optimal(plant))
-    run = cpjax.rollout(plant, law, start, duration=2.0, dt=1e-3, save_every=100)
+    run = cpjax.rollout(plant, law, start, clock="continuous", duration=2.0, dt=1e-3, save_every=100)
     assert np.all(np.abs(run.voltage) < 12.0)
     states, outputs = simulate(bridge.closed_loop_system(plant, law), np.asarray(run.time), columns(start), **TIGHT)
     assert np.max(np.abs(states - columns(run.state))) <= 1e-10
@@ -328,7 +330,7 @@ def test_python_controls_lqr_is_scipys_and_its_gain_catches_the_pole():
     P = solve_continuous_are(A, B, np.eye(4), [[0.1]])
     law = bridge.state_feedback(optimal(ROUGH))
     np.testing.assert_allclose(law.K, B.T @ P / 0.1, rtol=1e-9)
-    run = cpjax.rollout(ROUGH, law, State(0.1, 0.0, 0.2, 0.0), duration=12.0, dt=1e-3)
+    run = cpjax.rollout(ROUGH, law, State(0.1, 0.0, 0.2, 0.0), clock="continuous", duration=12.0, dt=1e-3)
     assert bool(run.metrics.success)
 
 

@@ -62,7 +62,7 @@ def test_a_smooth_loops_derivatives_agree_with_differences_and_it_goes_where_the
 
     def end(x):
         law = SmoothClip(SmoothHybrid(HARD.swing_up, HARD.regulator, HARD.gate, x[0]), 12.0, 12.0 * x[0])
-        return cpjax.rollout(PLANT, law, start, duration=2.4, dt=2e-3).state.vector()[-1]
+        return cpjax.rollout(PLANT, law, start, clock="continuous", duration=2.4, dt=2e-3).state.vector()[-1]
 
     hard = cpjax.rollout(PLANT, HARD, start, duration=2.4, dt=2e-3, switching="located").state.vector()[-1]
     batched = jax.jit(jax.vmap(end))

@@ -236,7 +236,7 @@ def certified(gain, half_angle, limit=12.0, weight=None):
 def metrics_from():
     def run(points):
         starts = State(*(jnp.asarray(column) for column in points.T))
-        return sweep(PLANT, StateFeedback(K), starts, duration=8.0, dt=0.005)
+        return sweep(PLANT, StateFeedback(K), starts, clock="continuous", duration=8.0, dt=0.005)
 
     return run
 

@@ -103,7 +103,7 @@ def error_before_the_switch(run, swing, dt):
 def test_before_the_switch_the_clipped_continuous_loop_from_rest_is_scipys():
     ours, oracle = hybrid(POINT_BOB, SOFT)
     swing = swing_until_the_switch(POINT_BOB, oracle, columns(HANGING), 1.8)
-    run = cpjax.rollout(POINT_BOB, ours, HANGING, duration=1.8, dt=1e-3)
+    run = cpjax.rollout(POINT_BOB, ours, HANGING, clock="continuous", duration=1.8, dt=1e-3)
     error, clipped = error_before_the_switch(run, swing, 1e-3)
     assert 0.4 < np.mean(clipped) < 0.9
     assert np.sum(clipped[1:] != clipped[:-1]) >= 4
@@ -114,7 +114,7 @@ def test_it_is_the_clip_that_costs_accuracy_before_the_switch():
     plant = replace(POINT_BOB, motor=replace(POINT_BOB.motor, voltage_limit=math.inf))
     ours, oracle = hybrid(plant, SOFT)
     swing = swing_until_the_switch(plant, oracle, columns(HANGING), 1.0)
-    run = cpjax.rollout(plant, ours, HANGING, duration=1.0, dt=1e-3)
+    run = cpjax.rollout(plant, ours, HANGING, clock="continuous", duration=1.0, dt=1e-3)
     error, _ = error_before_the_switch(run, swing, 1e-3)
     assert error <= 1e-6
 
@@ -149,7 +149,8 @@ class ContinuousReference:
         """By start: the largest error before the switch, and the error at the end."""
         before, after = [], []
         for start, swing, end in zip(self.starts, self.swings, self.ends, strict=True):
-            run = cpjax.rollout(POINT_BOB, self.ours, start, duration=self.duration, dt=dt, switching=switching)
+            settings = {"duration": self.duration, "dt": dt, "clock": "continuous", "switching": switching}
+            run = cpjax.rollout(POINT_BOB, self.ours, start, **settings)
             error, _ = error_before_the_switch(run, swing, dt)
             before.append(error)
             after.append(np.max(np.abs(columns(run.state)[-1] - end)))

@@ -16,7 +16,9 @@ def outside(p, start):
     law = cpjax.EnergySwingUp(
         PLANT, energy_gain=p["energy_gain"], cart_damping=p["cart"][0], cart_stiffness=p["cart"][1]
     )
-    return cpjax.measure(PLANT, law, start, duration=0.6, dt=0.01, metrics=cpjax.TimeOutside(1.5, 0.5))
+    return cpjax.measure(
+        PLANT, law, start, clock="continuous", duration=0.6, dt=0.01, metrics=cpjax.TimeOutside(1.5, 0.5)
+    )
 
 
 def parameters():
@@ -84,7 +86,14 @@ def test_segments_keep_less():
     def cost(p, start, checkpoint):
         law = cpjax.EnergySwingUp(PLANT, energy_gain=p)
         return cpjax.measure(
-            PLANT, law, start, duration=90.0, dt=0.01, checkpoint=checkpoint, metrics=cpjax.TimeOutside(1.5, 0.5)
+            PLANT,
+            law,
+            start,
+            clock="continuous",
+            duration=90.0,
+            dt=0.01,
+            checkpoint=checkpoint,
+            metrics=cpjax.TimeOutside(1.5, 0.5),
         )
 
     start = cpjax.State(*map(jnp.asarray, (0.0, 0.0, 3.0, 0.0)))

@@ -65,6 +65,7 @@ def test_the_error_of_a_rollout_shrinks_with_its_integrators_order(name):
             plant,
             StateFeedback([0.0, 0.0, 0.0, 0.0]),
             start,
+            clock="continuous",
             duration=duration,
             dt=duration / count,
             integrator=name,

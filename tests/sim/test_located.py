@@ -60,7 +60,8 @@ def test_without_clip_and_crossing_it_is_the_rollout_that_reads_its_mode_per_ste
     law = loop(plant=plant).swing_up
     start = State(0.0, 0.0, 3.0, 0.0)
     found, other = (
-        cpjax.rollout(plant, law, start, duration=0.6, dt=2e-3, switching=s) for s in ("located", "per_step")
+        cpjax.rollout(plant, law, start, duration=0.6, dt=2e-3, clock="continuous", switching=s)
+        for s in ("located", "per_step")
     )
     assert np.max(np.abs(other.voltage)) > 12.0
     for name in ("time", "voltage", "mode", "cart_acceleration", "flag"):
@@ -271,7 +272,7 @@ def test_a_controller_whose_switch_cannot_be_located_is_refused_and_runs_per_ste
     controller = pytree(Steps)()
     with pytest.raises(InputError, match="margin and successor"):
         located(PLANT, controller, NEAR)
-    assert cpjax.rollout(PLANT, controller, NEAR, duration=0.1, dt=0.01).flag == 0
+    assert cpjax.rollout(PLANT, controller, NEAR, clock="continuous", duration=0.1, dt=0.01).flag == 0
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------

@@ -93,7 +93,8 @@ def test_the_settling_metrics_know_late_early_and_lost_bands():
                 voltage_until=None,
                 mode=jnp.asarray(1),
                 mode_before=jnp.asarray(1),
-                cart_acceleration=zero,
+                outputs={"cart_acceleration": zero},
+                plant_mode=(),
                 flag=jnp.asarray(0),
                 crossing=jnp.asarray(0),
                 crossing_speed=zero,
@@ -150,11 +151,11 @@ def test_a_dense_sampled_clock_approaches_the_continuous_one():
 
 def test_the_effort_of_the_continuous_clock_is_the_integral_of_the_squared_voltage():
     gentle = cpjax.EnergySwingUp(PLANT, energy_gain=0.5, kick=0.0)
-    fine = cpjax.rollout(PLANT, gentle, START, duration=1.0, dt=0.0005)
+    fine = cpjax.rollout(PLANT, gentle, START, clock="continuous", duration=1.0, dt=0.0005)
     from scipy.integrate import simpson
 
     expected = simpson(np.asarray(fine.voltage) ** 2, dx=0.0005)
-    coarse = cpjax.measure(PLANT, gentle, START, duration=1.0, dt=0.002)
+    coarse = cpjax.measure(PLANT, gentle, START, clock="continuous", duration=1.0, dt=0.002)
     assert float(coarse.effort) == pytest.approx(expected, rel=1e-5)
 
 
@@ -190,7 +191,7 @@ def test_a_float32_start_makes_a_float32_rollout_close_to_the_float64_one(clock)
 def test_a_rollout_that_runs_away_is_flagged_held_and_no_success():
     wild = cpjax.StateFeedback([0.0, -50.0, 0.0, 0.0])  # pushes the cart the way it goes
     unlimited = dataclasses.replace(PLANT, motor=dataclasses.replace(PLANT.motor, voltage_limit=math.inf))
-    run = cpjax.rollout(unlimited, wild, State(0.0, 0.1, 0.3, 0.0), duration=4.0, dt=0.002)
+    run = cpjax.rollout(unlimited, wild, State(0.0, 0.1, 0.3, 0.0), clock="continuous", duration=4.0, dt=0.002)
     assert int(run.flag) & Flag.RUNAWAY
     assert describe(int(run.flag)) == "runaway"
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(run.state))
@@ -203,7 +204,9 @@ def test_a_rollout_that_runs_away_is_flagged_held_and_no_success():
 def test_a_non_finite_parameter_under_jit_is_flagged_and_raises_nothing():
     @jax.jit
     def run(mass):
-        return cpjax.rollout(dataclasses.replace(PLANT, cart_mass=mass), CENTRED, START, duration=0.1, dt=0.002)
+        return cpjax.rollout(
+            dataclasses.replace(PLANT, cart_mass=mass), CENTRED, START, clock="continuous", duration=0.1, dt=0.002
+        )
 
     result = run(jnp.nan)
     assert int(result.flag) & Flag.NON_FINITE
@@ -257,7 +260,8 @@ def test_gradients_are_finite_from_the_ugly_starts(theta, dtype):
     """Hanging at rest, at -pi, upright at rest, exactly on the gate."""
 
     def travel(start, plant):
-        run = cpjax.rollout(plant, CENTRED, start, duration=0.4, dt=0.004)
+        settings = {"duration": 0.4, "dt": 0.004, "clock": "continuous", "derivative": "pathwise"}
+        run = cpjax.rollout(plant, CENTRED, start, **settings)
         return run.state.theta[-1] + run.metrics.effort + run.metrics.cart_travel + run.metrics.voltage_variation
 
     start = jax.tree.map(dtype, State(0.0, 0.0, theta, 0.0))
@@ -290,7 +294,7 @@ def test_a_stopped_run_adds_nothing_more_to_its_effort():
     wild = cpjax.StateFeedback([0.0, -50.0, 0.0, 0.0])
     unlimited = dataclasses.replace(PLANT, motor=dataclasses.replace(PLANT.motor, voltage_limit=math.inf))
     start = State(0.0, 0.1, 0.3, 0.0)
-    short, long = (cpjax.measure(unlimited, wild, start, duration=d, dt=0.002) for d in (1.0, 4.0))
+    short, long = (cpjax.measure(unlimited, wild, start, clock="continuous", duration=d, dt=0.002) for d in (1.0, 4.0))
     assert int(short.flag) & Flag.RUNAWAY
     assert float(long.effort) == float(short.effort)
 
@@ -312,14 +316,16 @@ class CubicLaw:
 
 def test_a_law_of_ones_own_runs_once_it_is_a_component():
     with jax.numpy_dtype_promotion("standard"):  # as users have it
-        run = cpjax.rollout(PLANT, CubicLaw(2.0), jax.tree.map(jnp.float32, START), duration=0.1, dt=0.002)
+        run = cpjax.rollout(
+            PLANT, CubicLaw(2.0), jax.tree.map(jnp.float32, START), clock="continuous", duration=0.1, dt=0.002
+        )
     assert run.voltage.dtype == jnp.float32
     assert float(run.voltage[0]) == pytest.approx(-2.0 * 0.05**3)
     with pytest.raises(cpjax.InputError, match=r"controller.* must be a number; a class of your own"):
-        cpjax.rollout(PLANT, OpaqueLaw(), START, duration=0.1, dt=0.002)
+        cpjax.rollout(PLANT, OpaqueLaw(), START, clock="continuous", duration=0.1, dt=0.002)
 
 
 def test_a_component_that_an_optimiser_moved_out_of_its_range_is_refused():
     moved = jax.tree.map(lambda leaf: leaf - 2.0, PLANT)
     with pytest.raises(cpjax.InputError, match=r"plant\.cart_mass = -1\.0: must be a finite number above 0"):
-        cpjax.rollout(moved, CENTRED, START, duration=0.1, dt=0.002)
+        cpjax.rollout(moved, CENTRED, START, clock="continuous", duration=0.1, dt=0.002)

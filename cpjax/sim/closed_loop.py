@@ -1,0 +1,145 @@
+"""Plant and controller as a `System` of smooth modes: what located switching integrates.
+
+On the continuous clock the guards are the two ends of the supply, the controller's margin, and the plant's own; on the
+sampled clock, on which the input is held, only the plant's own.
+"""
+
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.compilation import part_of_step
+from cpjax.controllers.protocol import SmoothController, demand
+from cpjax.returned import call, integer, real
+from cpjax.sim import plants
+from cpjax.sim.plants import Eventful, Plant, Tree
+from cpjax.sim.stepper import dtype_of
+from cpjax.sim.switching import Guards, Observation
+
+UPPER, LOWER, GATE = 0, 1, 2
+"""Numbers of the guards on the continuous clock: the ends of the supply, and the controller's margin."""
+
+GATE_CROSSING = GATE + 1
+"""`Sample.crossing` at a located change of the controller's mode."""
+
+
+class Mode(NamedTuple):
+    """In which the closed loop is smooth on the continuous clock."""
+
+    law: jax.Array
+    """The controller's mode, int32."""
+    clip: jax.Array
+    """Where the demanded voltage is: 1 above the limit, -1 below it, 0 inside, int32."""
+    plant: Tree
+    """The plant's own mode."""
+
+
+class ContinuousLoop(NamedTuple):
+    """Plant and controller on the continuous clock. Its output is the applied voltage.
+
+    The plant's drive has to clip at `plant.input_limit`, and do nothing else: where the demand reaches it is a guard
+    too.
+    """
+
+    plant: Plant
+    controller: SmoothController
+
+    def observe(self, q: Tree, v: Tree, mode: Mode) -> Observation:
+        state = plants.state_of(self.plant, q, v)
+        limit = input_limit(self.plant)
+        demanded = self._demand(state, mode.law)
+        relative = demanded / limit  # 0 for an infinite supply
+        margin = real("controller.margin", call("controller", self.controller, "margin", state, mode.law))
+        u = jnp.where(mode.clip == 0, demanded, jnp.where(mode.clip > 0, limit, -limit))
+        guards = (
+            jnp.where(mode.clip > 0, relative - 1.0, 1.0 - relative),
+            jnp.where(mode.clip < 0, -1.0 - relative, 1.0 + relative),
+            margin.astype(dtype_of(state)),
+            *plant_guards(self.plant, q, v, u, mode.plant),
+        )
+        return Observation(plant_accelerations(self.plant, q, v, u, mode.plant), guards, u)
+
+    def jump(self, q: Tree, v: Tree, mode: Mode, guard: jax.Array) -> tuple[Tree, Tree, Mode]:
+        state = plants.state_of(self.plant, q, v)
+        successor = integer("controller.successor", call("controller", self.controller, "successor", mode.law))
+        law = jnp.where(guard == GATE, successor, mode.law)
+        now = self._clip(state, law)
+        # On the limit itself rounding has the sign. A demand that has jumped past the other limit is beyond that one.
+        inside = jnp.where(now == -mode.clip, now, 0)
+        clip = jnp.where(mode.clip == 0, jnp.where(guard == UPPER, 1, -1), inside)
+        clip = jnp.where(guard == GATE, now, clip).astype(mode.clip.dtype)
+        if not isinstance(self.plant, Eventful):
+            return q, v, Mode(law, clip, mode.plant)
+        own = guard > GATE
+        after_q, after_v, after = plant_jump(self.plant, q, v, mode.plant, guard - (GATE + 1))
+        q, v, of_plant = jax.tree.map(
+            lambda new, old: jnp.where(own, new, old), (after_q, after_v, after), (q, v, mode.plant)
+        )
+        # A jump of the plant's state may move the demand over a limit.
+        clip = jnp.where(own, self._clip(plants.state_of(self.plant, q, v), law).astype(clip.dtype), clip)
+        return q, v, Mode(law, clip, of_plant)
+
+    def start_mode(self, start: Tree) -> Mode:
+        """Returns the mode at the start of a rollout."""
+        law = integer("controller.start_mode", call("controller", self.controller, "start_mode", start))
+        return Mode(law, self._clip(start, law), plants.start_mode(self.plant, *plants.coordinates(self.plant, start)))
+
+    def _clip(self, state: Tree, law: jax.Array) -> jax.Array:
+        demanded, limit = self._demand(state, law), input_limit(self.plant)
+        return (demanded > limit).astype(jnp.int32) - (demanded < -limit).astype(jnp.int32)
+
+    def _demand(self, state: Tree, law: jax.Array) -> jax.Array:
+        return demand(self.controller, state, law).astype(dtype_of(state))
+
+
+class HeldMode(NamedTuple):
+    """In which the plant is smooth between two control instants."""
+
+    u: jax.Array
+    """The input, held."""
+    plant: Tree
+    """The plant's own mode."""
+
+
+class HeldLoop(NamedTuple):
+    """A plant with events of its own under a held input. Its output is the input."""
+
+    plant: Plant
+
+    def observe(self, q: Tree, v: Tree, mode: HeldMode) -> Observation:
+        guards = plant_guards(self.plant, q, v, mode.u, mode.plant)
+        return Observation(plant_accelerations(self.plant, q, v, mode.u, mode.plant), guards, mode.u)
+
+    def jump(self, q: Tree, v: Tree, mode: HeldMode, guard: jax.Array) -> tuple[Tree, Tree, HeldMode]:
+        q, v, of_plant = plant_jump(self.plant, q, v, mode.plant, guard)
+        return q, v, mode._replace(plant=of_plant)
+
+
+System: TypeAlias = ContinuousLoop | HeldLoop
+
+
+def input_limit(plant: Any) -> Any:
+    """Returns the magnitude at which the plant's drive clips."""
+    return plant.input_limit
+
+
+def plant_accelerations(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Tree:
+    """Returns q''."""
+    geometry = plants.geometry(plant, q)
+    return part_of_step(plants.accelerations)(plant, geometry, v, u, mode)
+
+
+def plant_guards(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Guards:
+    """Returns the plant's own guards, if it has any."""
+    if not isinstance(plant, Eventful):
+        return ()
+    guards = call("plant", plant, "guards", q, v, u, mode)
+    return tuple(real(f"plant.guards[{i}]", guard, u.dtype) for i, guard in enumerate(guards))
+
+
+def plant_jump(plant: Any, q: Tree, v: Tree, mode: Tree, guard: jax.Array) -> tuple[Tree, Tree, Tree]:
+    """Returns positions, velocities and the plant's mode after one of its own guards has fallen."""
+    q_after, v_after, mode_after = call("plant", plant, "jump", q, v, mode, guard)
+    cast = lambda new, old: jnp.asarray(new, dtype=jnp.asarray(old).dtype)  # noqa: E731
+    return jax.tree.map(cast, (q_after, v_after, mode_after), (q, v, mode))

@@ -1,0 +1,57 @@
+"""Holding a run where it goes wrong: the one policy of all loops.
+
+A run that would leave the plant's limits, or become non-finite, is held at its last good state and flagged.
+
+A derivative in reverse passes through both branches of a `where`, and 0 times an infinity of the branch not taken is
+NaN. So a step that is about to go wrong (told by an Euler step of the velocities) is not taken from where it would: it
+is taken from zero, where all is finite, and dropped. (A law that is itself not finite at a state it is asked about
+still gives NaN derivatives; those of this library are finite.)
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cpjax.compilation import part_of_step
+from cpjax.pytree import Scalar
+from cpjax.sim import plants
+from cpjax.sim.flags import STOPPED, Flag
+from cpjax.sim.plants import Plant, Tree
+
+
+class Outlook(NamedTuple):
+    """What is known about a step before it is taken."""
+
+    possible: jax.Array
+    """Whether an Euler step keeps the velocities within the plant's limits."""
+    ahead: Tree
+    """The velocities after an Euler step."""
+
+
+def look_ahead(plant: Plant, v: Tree, acceleration: Tree, dt: Scalar) -> Outlook:
+    """Judges a step by an Euler step of the velocities."""
+    ahead = jax.tree.map(lambda velocity, change: velocity + dt * change, v, acceleration)
+    return Outlook(plants.within(ahead, plants.coordinates(plant, plant.limits)[1]), ahead)
+
+
+def is_stopped(flag: jax.Array) -> jax.Array:
+    """Whether a flag has stopped the run."""
+    return (flag & STOPPED) != 0
+
+
+def safe(going: jax.Array, tree: Any) -> Any:
+    """Returns the tree where the run goes on, and zeros where it does not."""
+    return jax.tree.map(lambda value: jnp.where(going, value, jnp.zeros((), jnp.asarray(value).dtype)), tree)
+
+
+def verdict(plant: Plant, after: Tree, outlook: Outlook) -> tuple[jax.Array, jax.Array]:
+    """Returns whether the state after a step is within the limits, and the flag for a step that is not."""
+    within, finite = part_of_step(_judged)(after, outlook.ahead, plant.limits)
+    return within, jnp.where(finite, np.int32(Flag.RUNAWAY), np.int32(Flag.NON_FINITE))
+
+
+def _judged(after: Tree, ahead: Tree, limits: Tree) -> tuple[jax.Array, jax.Array]:
+    total = sum(jax.tree.leaves(ahead)) + sum(jax.tree.leaves(after))
+    return plants.within(after, limits), jnp.isfinite(total)

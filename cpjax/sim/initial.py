@@ -1,0 +1,89 @@
+"""Checks of the initial state that a rollout is given."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cpjax.errors import InputError
+from cpjax.pytree import as_array, is_traced
+from cpjax.sim.plants import Plant
+
+
+def checked_initial(plant: Plant, start: Any, field: str, *, batched: bool) -> tuple[Any, Any, int | None]:
+    """Returns `start` with arrays of one dtype for numbers, that dtype, and how many initial states there are.
+
+    Raises:
+      InputError: as `checked_tree` does.
+    """
+    units = getattr(plant, "units", {})
+    return checked_tree(start, plant.limits, units, field, batched=batched)
+
+
+def checked_tree(
+    start: Any, limits: Any, units: dict[str, str], field: str, *, batched: bool
+) -> tuple[Any, Any, int | None]:
+    """Returns a state with arrays of one dtype for numbers, that dtype, and its batch's length (None for one state).
+
+    Python numbers take the dtype of the arrays beside them, or JAX's default float if there are none.
+
+    Args:
+      limits: the largest magnitude of each component, of the structure that `start` has to have.
+      units: of components, by name, for error messages.
+
+    Raises:
+      InputError: another structure; a component that is not real, not finite, beyond its limit, of another dtype than
+        the rest, or not of shape () (`batched=False`) or one common (n,) (`batched=True`).
+    """
+    structure: Any = jax.tree.structure(limits)
+    try:
+        leaves = structure.flatten_up_to(start)
+    except (ValueError, TypeError) as problem:
+        kind = type(limits)
+        components = ", ".join(_name(path) for path, _ in jax.tree_util.tree_leaves_with_path(limits))
+        where = "cpjax." if kind.__module__.startswith("cpjax.") else ""
+        raise InputError(field, start, f"a {where}{kind.__name__}({components})") from problem
+    pairs = jax.tree_util.tree_leaves_with_path(limits)
+    names = [_name(path) for path, _ in pairs]
+    dtypes = {}
+    for name, value, (_, limit) in zip(names, leaves, pairs, strict=True):
+        path = f"{field}.{name}"
+        within = f"finite, and within {limit:g} {units.get(name, '')}".rstrip()
+        if isinstance(value, bool) or not (isinstance(value, (int, float)) or hasattr(value, "dtype")):
+            raise InputError(path, value, "a real number or an array of them")
+        if isinstance(value, (int, float)):
+            if not abs(value) <= limit:
+                raise InputError(path, value, within)
+        else:
+            dtypes[name] = jnp.dtype(value.dtype) if is_traced(value) else jax.dtypes.canonicalize_dtype(value.dtype)
+            if dtypes[name] not in (jnp.float32, jnp.float64):
+                raise InputError(path, f"array of dtype {value.dtype}", "of dtype float32 or float64")
+            if not is_traced(value) and not np.all(np.abs(np.asarray(value)) <= limit):
+                raise InputError(path, value, within)
+    name_of_type = type(start).__name__
+    if len(set(dtypes.values())) > 1:
+        mixture = ", ".join(f"{name}: {dtype}" for name, dtype in dtypes.items())
+        raise InputError(field, f"{name_of_type} with dtypes {mixture}", "of one dtype, float32 or float64, throughout")
+    dtype = next(iter(dtypes.values()), jnp.result_type(float))
+    values = [as_array(value, dtype) for value in leaves]
+    count = None
+    if batched:
+        shapes = f"{name_of_type} of shapes {[v.shape for v in values]}"
+        if max(v.ndim for v in values) > 1 or min(v.size for v in values) == 0:
+            raise InputError(field, shapes, "arrays of one shape (n,), n at least 1")
+        try:
+            values = list(jnp.broadcast_arrays(*[jnp.atleast_1d(v) for v in values]))
+        except ValueError as problem:
+            raise InputError(field, shapes, "arrays of one shape (n,), n at least 1") from problem
+        count = values[0].shape[0]
+    else:
+        for name, value in zip(names, values, strict=True):
+            if value.ndim:
+                allowed = "one number; many starts go through cpjax.sweep or jax.vmap"
+                raise InputError(f"{field}.{name}", f"array of shape {value.shape}", allowed)
+    return jax.tree.unflatten(structure, values), dtype, count
+
+
+def _name(path: Any) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".")

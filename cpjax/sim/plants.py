@@ -1,0 +1,148 @@
+"""What the loop asks of a plant, and the few things it does with one. Independent of any particular plant.
+
+A plant is a second-order system q'' = a(q, v, u) with one input u, the positions q and velocities v being two pytrees
+of the same structure. Its state may be any pytree of scalars.
+"""
+
+from typing import Any, Protocol, TypeAlias, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.errors import InputError
+from cpjax.pytree import Scalar
+from cpjax.returned import call, like, pair, real
+
+Tree: TypeAlias = Any
+"""A pytree of scalars."""
+
+
+@runtime_checkable
+class Plant(Protocol):
+    """A second-order system with one input. A pytree: its numbers may be traced.
+
+    Positions, velocities and accelerations at zero state and zero input have to be finite: a run that has gone wrong is
+    continued from there, and its result dropped.
+    """
+
+    @property
+    def limits(self) -> Tree:
+        """The largest magnitude of each component of the state, as a state; a run that goes beyond is stopped."""
+        ...
+
+    def coordinates(self, state: Tree) -> tuple[Tree, Tree]:
+        """Returns positions and velocities (q, v) of a state."""
+        ...
+
+    def state(self, q: Tree, v: Tree) -> Tree:
+        """Returns the state of these positions and velocities."""
+        ...
+
+    def saturate(self, command: Scalar) -> Scalar:
+        """Returns the input that the drive makes of a command."""
+        ...
+
+    def accelerations(self, geometry: Tree, v: Tree, u: Scalar) -> Tree:
+        """Returns q'', of the structure of v, under the input u.
+
+        Args:
+          geometry: what `geometry(q)` returns, for a plant that has it (see `Geometric`); else q.
+        """
+        ...
+
+
+@runtime_checkable
+class Geometric(Protocol):
+    """A plant whose accelerations see its positions through functions that are worth sharing, such as sine and
+    cosine."""
+
+    def geometry(self, q: Tree) -> Tree:
+        """Returns what `accelerations` needs of the positions."""
+        ...
+
+    def geometry_near(self, geometry: Tree, change: Tree) -> tuple[Tree, jax.Array]:
+        """Returns the geometry at q + `change`, given that at q, and whether it is accurate to rounding.
+
+        It has to cost less than `geometry`, and may be inaccurate for large changes. `sweep` uses it for values.
+        """
+        ...
+
+
+@runtime_checkable
+class Eventful(Protocol):
+    """A plant with modes of its own, such as stick and slip, or the ends of a track.
+
+    Its `accelerations` take the mode as a fourth argument. A mode ends where a guard, a smooth function, falls below
+    zero; that moment is located inside the integrator's step.
+    """
+
+    def start_mode(self, q: Tree, v: Tree) -> Tree:
+        """Returns the mode at the start: a pytree of int32 scalars."""
+        ...
+
+    def guards(self, q: Tree, v: Tree, u: Scalar, mode: Tree) -> tuple[Scalar, ...]:
+        """Returns numbers that are at least 0 while the mode lasts; always as many, smooth in q, v and u."""
+        ...
+
+    def jump(self, q: Tree, v: Tree, mode: Tree, guard: jax.Array) -> tuple[Tree, Tree, Tree]:
+        """Returns positions, velocities and mode after the guard of this number (int32) has fallen."""
+        ...
+
+
+def check_plant(plant: Any) -> None:
+    """Checks that a plant has all that the loop asks for.
+
+    Raises:
+      InputError: a method is missing, or `limits` and `coordinates` do not fit each other.
+    """
+    needed = ("limits", "coordinates", "state", "saturate", "accelerations")
+    missing = [name for name in needed if not hasattr(plant, name)]
+    if missing or isinstance(plant, type):
+        raise InputError("plant", plant, f"a cpjax.CartPole, or a plant of your own with {', '.join(needed)}")
+
+
+def coordinates(plant: Plant, state: Tree) -> tuple[Tree, Tree]:
+    """Returns (q, v) of a state."""
+    return pair("plant.coordinates", call("plant", plant, "coordinates", state), "positions and velocities")
+
+
+def state_of(plant: Plant, q: Tree, v: Tree) -> Tree:
+    """Returns the state of (q, v)."""
+    return call("plant", plant, "state", q, v)
+
+
+def geometry(plant: Plant, q: Tree) -> Tree:
+    """Returns what `accelerations` needs of the positions."""
+    return plant.geometry(q) if isinstance(plant, Geometric) else q
+
+
+def geometry_near(plant: Plant, at: Tree, q: Tree, change: Tree) -> tuple[Tree, jax.Array]:
+    """Returns the geometry at q, which is `change` away from where it was `at`, and whether it is accurate."""
+    return plant.geometry_near(at, change) if isinstance(plant, Geometric) else (q, jnp.asarray(True))
+
+
+def accelerations(plant: Plant, geometry: Tree, v: Tree, u: Scalar, mode: Tree = ()) -> Tree:
+    """Returns q'' under the input u, in a plant's own mode if it has modes."""
+    arguments = (geometry, v, u, mode) if isinstance(plant, Eventful) else (geometry, v, u)
+    return like("plant.accelerations", call("plant", plant, "accelerations", *arguments), v)
+
+
+def saturate(plant: Plant, command: jax.Array) -> jax.Array:
+    """Returns the input that the drive makes of a command, in the command's dtype."""
+    return real("plant.saturate", call("plant", plant, "saturate", command), command.dtype)
+
+
+def start_mode(plant: Plant, q: Tree, v: Tree) -> Tree:
+    """Returns the plant's own mode at the start; () for a plant without modes."""
+    return call("plant", plant, "start_mode", q, v) if isinstance(plant, Eventful) else ()
+
+
+def outputs(plant: Plant, state: Tree, acceleration: Tree, u: Scalar) -> dict[str, Any]:
+    """Returns what the plant wants kept of a sample beside state and input, by name; nothing by default."""
+    return dict(plant.outputs(state, acceleration, u)) if hasattr(plant, "outputs") else {}
+
+
+def within(tree: Tree, limits: Tree) -> jax.Array:
+    """Whether no number of the tree is larger in magnitude than its limit, or NaN."""
+    inside = jax.tree.map(lambda value, limit: jnp.abs(value) <= limit, tree, limits)
+    return jax.tree.reduce(jnp.logical_and, inside)
