@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from cpjax.bridges.known import UNTRACEABLE, known_plant, refuse_unknown
+from cpjax.bridges.known import UNTRACEABLE, known_plant, refuse_unknown, unexpressed
 from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import Controller, Law, SingleLaw, as_controller
@@ -167,16 +167,17 @@ def state_feedback(gain: Any) -> StateFeedback:
 
 
 def _derivative(plant: CartPole, state: Vector, voltage: float) -> tuple[Any, ...]:
-    """`CartPole.vector_field` under the applied voltage [V], in Python's floats, which the plant must hold too."""
+    """`vector_field` of any plant under the applied voltage [V], as Python's floats, which the plant must hold too."""
     _, x_dot, theta, theta_dot = state.tolist()
-    force = plant.motor.force(voltage, x_dot)
+    # What a plant or motor writes with JAX's functions comes out as arrays.
+    force = float(plant.motor.force(voltage, x_dot))
     x_ddot, theta_ddot = plant.acceleration(math.sin(theta), math.cos(theta), (x_dot, theta_dot), force)
-    return x_dot, x_ddot, theta_dot, theta_ddot
+    return x_dot, float(x_ddot), theta_dot, float(theta_ddot)
 
 
 def _saturation(motor: Motor) -> Callable[[float], float]:
     """`motor.saturate` for Python's floats; that of cpjax's own motor without a call into JAX. NaN stays NaN."""
-    if type(motor) is not Motor:
+    if type(motor) is not Motor or unexpressed(motor):
         return lambda voltage: float(motor.saturate(voltage))
     limit = float(motor.voltage_limit)
     return lambda voltage: max(min(voltage, limit), -limit)
