@@ -154,11 +154,13 @@ def test_mujocos_model_refuses_a_plant_or_motor_of_another_class_by_its_name():
         model_xml(plant, 1e-3)
 
 
-def test_a_plant_written_with_jaxs_functions_moves_in_python_control_in_floats_and_as_it_should():
+@pytest.mark.parametrize("float64", [True, False])
+def test_a_plant_written_with_jaxs_functions_moves_in_python_control_in_floats_and_as_it_should(float64):
     motor = as_class(MotorWithDryBearings, ROUGH.motor, dry_friction=0.4)
     plant = as_class(CartPoleWithDrag, dataclasses.replace(ROUGH, motor=motor), drag=0.7)
     state, voltage = State(0.1, 1.5, 0.4, -2.0), 5.0
-    found = plant_system(plant).updfcn(0.0, columns(state), [voltage], {})
+    with jax.enable_x64(float64):
+        found = plant_system(plant).updfcn(0.0, columns(state), [voltage], {})
     assert [type(number) for number in found] == [float] * 4
     # Both frictions act where the wheels push: as if the voltage were smaller.
     less = (0.4 * np.tanh(150.0) + 0.7 * 1.5**2) / float(ROUGH.motor.force_per_voltage)
