@@ -13,6 +13,9 @@ gives (paper, section III, with its sign error mended; see docs/paper.md)
 `CartPole.acceleration` is the only place that solves these for x'' and th''.
 """
 
+import dataclasses
+import math
+from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import jax
@@ -22,12 +25,35 @@ import numpy as np
 from cpjax.errors import InputError
 from cpjax.numeric.extremes import larger, smaller
 from cpjax.numeric.trigonometry import LARGEST_TURN, sin_cos, turned
-from cpjax.pytree import Number, Scalar, check, is_traced, number, part, pytree
+from cpjax.pytree import Number, Scalar, check, is_traced, number, numbers, part, pytree
 from cpjax.returned import call, real
 from cpjax.state import ANGLE_LIMIT, HANGING, NAMES, RUNAWAY_LIMIT, UNITS, UPRIGHT, State
 
 Pair: TypeAlias = tuple[Scalar, Scalar]
 """One number for the cart, one for the pole."""
+
+# Sizes at which a parameter that is zero would matter on a plant: declared below, at the fields.
+
+
+def _swing(plant: "CartPole") -> float:
+    """The inertia of a point bob about the pivot, m l^2."""
+    return float(plant.pole_mass) * float(plant.pole_length) ** 2
+
+
+def _pivot_damping(plant: "CartPole") -> float:
+    """That of a point bob of quality factor 1, m l^2 sqrt(g / l)."""
+    return _swing(plant) * math.sqrt(float(plant.gravity) / float(plant.pole_length))
+
+
+def _fifth_of_critical_damping(plant: "CartPole") -> float:
+    """Of the pendulum, 0.4 sqrt(m g l (J + m l^2))."""
+    weight = float(plant.pole_mass) * float(plant.gravity) * float(plant.pole_length)
+    return 0.4 * math.sqrt(weight * float(plant.pivot_inertia))
+
+
+def _at_the_rotor(of_the_cart: float, plant: "CartPole") -> Scalar:
+    """A mass or a damping of the cart as one of the rotor."""
+    return of_the_cart * (plant.motor.wheel_radius / plant.motor.gear_ratio) ** 2
 
 
 @pytree
@@ -38,14 +64,36 @@ class Motor:
     F = n k_T i / r - n^2 B_m x' / r^2.
     """
 
-    torque_constant: Scalar = number("N m/A", "torque per current, k_T", default=1.25, above=0.0)
-    back_emf_constant: Scalar = number("V s/rad", "voltage per rotor speed, k_V", default=1.0, at_least=0.0)
-    resistance: Scalar = number("ohm", "resistance of the winding, R", default=1.25, above=0.0)
-    rotor_inertia: Scalar = number("kg m^2", "rotor inertia, J_m", default=7e-6, at_least=0.0)
-    viscous_friction: Scalar = number("N m s/rad", "bearing friction, B_m", default=1e-5, at_least=0.0)
+    torque_constant: Scalar = number("N m/A", "torque per current, k_T", default=1.25, above=0.0, uncertain=True)
+    back_emf_constant: Scalar = number(
+        "V s/rad",
+        "voltage per rotor speed, k_V",
+        default=1.0,
+        at_least=0.0,
+        uncertain=True,
+        typical=lambda plant: plant.motor.torque_constant,
+        drawn=0.0,  # a motor without back-EMF is an idealisation, not one whose back-EMF happens to be small
+    )
+    resistance: Scalar = number("ohm", "resistance of the winding, R", default=1.25, above=0.0, uncertain=True)
+    rotor_inertia: Scalar = number(
+        "kg m^2",
+        "rotor inertia, J_m",
+        default=7e-6,
+        at_least=0.0,
+        typical=lambda plant: _at_the_rotor(float(plant.cart_mass), plant),
+    )
+    viscous_friction: Scalar = number(
+        "N m s/rad",
+        "bearing friction, B_m",
+        default=1e-5,
+        at_least=0.0,
+        typical=lambda plant: _at_the_rotor(float(plant.motor.damping), plant),
+    )
     wheel_radius: Scalar = number("m", "wheel radius, r", default=1.0, above=0.0)
     gear_ratio: Scalar = number("1", "rotor turns per wheel turn, n", default=1.0, above=0.0)
-    voltage_limit: Scalar = number("V", "supply: |u| is clipped here", default=12.0, above=0.0, infinite=True)
+    voltage_limit: Scalar = number(
+        "V", "supply: |u| is clipped here", default=12.0, above=0.0, infinite=True, linear=False
+    )
 
     def saturate(self, voltage: Scalar) -> jax.Array:
         """The demanded voltage [V] clipped to the supply. Derivative 1 inside, 0 outside, 1/2 exactly on the limit."""
@@ -101,13 +149,32 @@ class LinearModel(NamedTuple):
 class CartPole:
     """Cart, pole and motor. Defaults: the paper's appendix (a point bob on a massless pole, no friction)."""
 
-    cart_mass: Scalar = number("kg", "mass of the cart, m_1", default=1.0, above=0.0)
-    pole_mass: Scalar = number("kg", "mass of the pole, m_2", default=0.5, above=0.0)
-    pole_length: Scalar = number("m", "pivot to the pole's centre of mass, l", default=0.7, above=0.0)
+    cart_mass: Scalar = number("kg", "mass of the cart, m_1", default=1.0, above=0.0, uncertain=True)
+    pole_mass: Scalar = number("kg", "mass of the pole, m_2", default=0.5, above=0.0, uncertain=True)
+    pole_length: Scalar = number("m", "pivot to the pole's centre of mass, l", default=0.7, above=0.0, uncertain=True)
     gravity: Scalar = number("m/s^2", "gravity, g", default=9.81, above=0.0)
-    pole_inertia: Scalar = number("kg m^2", "pole inertia about its centre of mass, J", default=0.0, at_least=0.0)
-    cart_friction: Scalar = number("N s/m", "viscous friction of the cart, c", default=0.0, at_least=0.0)
-    pivot_friction: Scalar = number("N m s/rad", "viscous friction of the pivot, b", default=0.0, at_least=0.0)
+    pole_inertia: Scalar = number(
+        "kg m^2", "pole inertia about its centre of mass, J", default=0.0, at_least=0.0, typical=_swing
+    )
+    cart_friction: Scalar = number(
+        "N s/m",
+        "viscous friction of the cart, c",
+        default=0.0,
+        at_least=0.0,
+        uncertain=True,
+        typical=lambda plant: plant.motor.damping,
+        change=0.1,
+    )
+    pivot_friction: Scalar = number(
+        "N m s/rad",
+        "viscous friction of the pivot, b",
+        default=0.0,
+        at_least=0.0,
+        uncertain=True,
+        typical=_pivot_damping,
+        drawn=_fifth_of_critical_damping,
+        change=0.01,
+    )
     motor: Motor = part("a cpjax.Motor", "saturate", "force", "reflected_mass", default_factory=Motor)
 
     @classmethod
@@ -256,6 +323,34 @@ class CartPole:
         """Power lost in the cart's and the pivot's friction [W]; the motor's own losses are inside the wheel force."""
         cart = self.cart_friction * state.x_dot * state.x_dot
         return cart + self.pivot_friction * state.theta_dot * state.theta_dot
+
+
+def parameters_of(plant: CartPole) -> dict[str, Number]:
+    """The declared numbers of a plant and its motor, by name, in order."""
+    return numbers(type(plant), type(plant.motor))
+
+
+def parameter(plant: CartPole, name: str) -> Scalar:
+    """The value of a number of the plant or of its motor."""
+    value: Scalar = getattr(plant if name in numbers(type(plant)) else plant.motor, name)
+    return value
+
+
+def with_parameters(plant: CartPole, values: Mapping[str, Any]) -> CartPole:
+    """The plant with some of its or its motor's numbers replaced.
+
+    Raises:
+      InputError: a name that neither declares, or a concrete value outside its range.
+    """
+    own, motor = numbers(type(plant)), numbers(type(plant.motor))
+    for name in values:
+        if name not in own and name not in motor:
+            raise InputError(name, values[name], "the value of one of " + ", ".join((*own, *motor)))
+    changes = {name: value for name, value in values.items() if name in own}
+    others = {name: value for name, value in values.items() if name not in own}
+    if others:
+        changes["motor"] = dataclasses.replace(plant.motor, **others)
+    return dataclasses.replace(plant, **changes)
 
 
 def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | State = "upright") -> LinearModel:

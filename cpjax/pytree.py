@@ -10,7 +10,8 @@ options, the files' keys and the documentation, so that a parameter is described
 import dataclasses
 import functools
 import math
-from typing import Any, TypeAlias, TypeVar, dataclass_transform
+from collections.abc import Callable
+from typing import Any, Literal, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +25,31 @@ Array: TypeAlias = jax.Array | np.ndarray[Any, Any]
 Scalar: TypeAlias = Array | float
 """One real number: a Python float, or an array of shape () that JAX may trace. Batches appear only under `vmap`."""
 
+Size: TypeAlias = float | Callable[[Any], Any]
+"""A size in the parameter's unit: a number, or a function of the component; for a motor's parameter, of the plant."""
+
 T = TypeVar("T")
 _RULE = "cpjax"  # key of a field's declaration in dataclasses' metadata
 
 
 @dataclasses.dataclass(frozen=True)
 class Number:
-    """Declaration of a real-valued field: unit, one line of help, and the open or closed ends of its range."""
+    """Declaration of a real-valued field: all that other modules need to know of the parameter.
+
+    Attributes:
+      unit: in SI, as text.
+      help: one line.
+      above, at_least, below, at_most: the open or closed ends of the range.
+      infinite: whether an infinity is allowed.
+      typical: size at which the parameter matters; used where its value is zero, as a share of zero is zero. 1 in the
+        parameter's unit if not declared.
+      linear: whether the linear model about upright may depend on it: audits of printed gains let it change.
+      uncertain: whether a rig's owner does not know it well: `sample_plants` draws it, audits of gradients vary it.
+      drawn: where an uncertain one is zero, its spread is a share of this; `typical` if not declared.
+      change: where it is zero, what an audit of gradients counts as a whole change; `typical` if not declared.
+      neutral: value at which the plant moves as if it had no such parameter. A bridge that cannot express the
+        parameter refuses any other.
+    """
 
     unit: str
     help: str
@@ -39,6 +58,23 @@ class Number:
     below: float = math.inf
     at_most: float = math.inf
     infinite: bool = False
+    typical: Size | None = None
+    linear: bool = True
+    uncertain: bool = False
+    drawn: Size | None = None
+    change: Size | None = None
+    neutral: float = 0.0
+
+    def size(self, owner: Any, use: Literal["typical", "drawn", "change"] = "typical") -> float:
+        """What stands for the parameter's size in `owner` where its value is zero."""
+        own = getattr(self, use)
+        size = self.typical if own is None else own
+        return 1.0 if size is None else float(size(owner) if callable(size) else size)
+
+    @property
+    def scales(self) -> bool:
+        """Whether the range holds every positive number, so that a value may be multiplied by any factor."""
+        return max(self.above, self.at_least) <= 0.0 and min(self.below, self.at_most) == math.inf
 
     def allowed(self) -> str:
         """The range in words, as error messages and `--help` print it."""
@@ -129,9 +165,9 @@ class Part:
 Rule: TypeAlias = Number | Matrix | Part
 
 
-def number(unit: str, help: str, *, default: Any = dataclasses.MISSING, **ends: Any) -> Any:
-    """A real-valued field. `ends` are `above`, `at_least`, `below`, `at_most`, `infinite` (see `Number`)."""
-    return dataclasses.field(default=default, metadata={_RULE: Number(unit, help, **ends)})
+def number(unit: str, help: str, *, default: Any = dataclasses.MISSING, **more: Any) -> Any:
+    """A real-valued field. `more` are the remaining attributes of `Number`."""
+    return dataclasses.field(default=default, metadata={_RULE: Number(unit, help, **more)})
 
 
 def matrix(shape: tuple[int | None, ...], unit: str, help: str, *, symmetric: bool = False) -> Any:
@@ -150,6 +186,12 @@ def part(help: str, *needs: str, default: Any = dataclasses.MISSING, default_fac
 def rules(cls: type) -> dict[str, Rule]:
     """The declarations of a `pytree` class, by field name, in order; not to be changed."""
     return _rules(cls)
+
+
+def numbers(*classes: type) -> dict[str, Number]:
+    """The declared numbers of `pytree` classes, by field name, in order; other classes declare none."""
+    known = [cls for cls in classes if dataclasses.is_dataclass(cls)]
+    return {name: rule for cls in known for name, rule in rules(cls).items() if isinstance(rule, Number)}
 
 
 @functools.cache

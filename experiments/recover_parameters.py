@@ -17,11 +17,11 @@ import numpy as np
 from _common import run
 
 from cpjax import io, paper
-from cpjax.plant import CartPole, Motor, linearize
+from cpjax.plant import CartPole, Motor, linearize, with_parameters
 from cpjax.show.figures import save_figure
 from cpjax.show.forensics import DIRECTION_HEADER, FIT_HEADER, direction_cells, findings, fit_cells, picture, shown_fits
 from cpjax.study.forensics import GainAudit, audit_gains, document
-from cpjax.study.plant_fit import PARAMETERS, changed
+from cpjax.study.plant_fit import PARAMETERS
 from cpjax.study.printed_gains import PrintedGain
 from cpjax.study.printed_gains import printed_in_the_paper as papers_prints
 
@@ -110,7 +110,7 @@ def recovered_ratio(*, starts: int, seed: int) -> dict[str, Any]:
         return value_of(plant, INSEPARABLE[0]) / value_of(plant, INSEPARABLE[1])
 
     pairs = [fit for fit in audit.fits if len(fit.parameters) == 2]
-    found = [changed(wrong, dict(zip(f.parameters, f.values, strict=True))) for f in audit.fits]
+    found = [with_parameters(wrong, dict(zip(f.parameters, f.values, strict=True))) for f in audit.fits]
     row: dict[str, Any] = {
         "truth": {name: value_of(rig, name) for name in INSEPARABLE},
         "before": {name: value_of(wrong, name) for name in INSEPARABLE},
@@ -154,7 +154,7 @@ def random_rig(generator: np.random.Generator, names: Sequence[str]) -> tuple[Ca
         motor=motor,
     )
     wrong = {n: value_of(rig, n) * between(1.1, 1.5) ** generator.choice([-1, 1]) for n in names}
-    return rig, changed(rig, wrong)
+    return rig, with_parameters(rig, wrong)
 
 
 def prints_of(rig: CartPole) -> list[PrintedGain]:

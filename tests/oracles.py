@@ -3,6 +3,7 @@
 import itertools
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -13,7 +14,7 @@ NAMES = ("x", "x_dot", "theta", "theta_dot")
 
 
 def random_plants(count, seed):
-    """A batch of plants in which every parameter differs from its default and from every other plant's."""
+    """A batch of plants in which every parameter named here differs from its default and from every other plant's."""
     rng = np.random.default_rng(seed)
 
     def between(low, high):
@@ -29,7 +30,7 @@ def random_plants(count, seed):
         gear_ratio=between(0.3, 3.0),
         voltage_limit=between(6.0, 24.0),
     )
-    return CartPole(
+    plants = CartPole(
         cart_mass=between(0.3, 3.0),
         pole_mass=between(0.1, 1.5),
         pole_length=between(0.2, 1.5),
@@ -39,6 +40,7 @@ def random_plants(count, seed):
         pivot_friction=between(1e-3, 0.1),
         motor=motor,
     )
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count,)), plants)
 
 
 def random_states(count, seed):

@@ -154,8 +154,11 @@ BAD_FLAGS = [
     (("--starts", "-1"), ["starts = -1", "a whole number from 1 to 100000"]),
     (("--starts", "1.5"), ["--starts", "'1.5'"]),
     (("--starts", "1" + 20 * "0"), ["starts = 1000", "a whole number from 1 to 100000"]),
-    (("--most", "0"), ["most = 0", "a whole number from 1 to 14"]),
-    (("--most", "15"), ["most = 15", "a whole number from 1 to 14"]),
+    (("--most", "0"), ["most = 0", f"a whole number from 1 to {len(PARAMETERS)}"]),
+    (
+        ("--most", f"{len(PARAMETERS) + 1}"),
+        [f"most = {len(PARAMETERS) + 1}", f"a whole number from 1 to {len(PARAMETERS)}"],
+    ),
     (("--parameters", "gravity", "--most", "2"), ["most = 2", "a whole number from 1 to 1"]),
     (("--seed", "-1"), ["seed = -1", "a whole number, at least 0"]),
     (("--plant", "moon"), ["plant = 'moon'", "appendix, identified, or a file"]),

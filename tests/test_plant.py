@@ -11,6 +11,7 @@ from oracles import random_plants, random_problem, rough_plant
 
 import cpjax
 from cpjax import HANGING, UPRIGHT, CartPole, Motor, State, StateFeedback, paper
+from cpjax.plant import parameters_of
 from cpjax.sim.integrators import rk4
 
 UGLY_STATES = [
@@ -221,7 +222,7 @@ def check_derivatives(problems):
         return (4.0 * central(point, unit, 0.5e-3) - central(point, unit, 1e-3)) / 3.0
 
     forward, reverse = jax.vmap(jax.jacfwd(field))(points), jax.vmap(jax.jacrev(field))(points)
-    assert forward.shape == (len(points), 4, 4 + 1 + 15)
+    assert forward.shape == (len(points), 4, 4 + 1 + len(parameters_of(paper.appendix_plant())))
     scaled, differences = forward * units[:, None, :], jax.jit(jax.vmap(richardson))(points, units)
     norm = np.linalg.norm(scaled, axis=(1, 2), keepdims=True)
     assert np.max(np.abs(forward - reverse) * units[:, None, :] / norm) <= 1e-14

@@ -3,16 +3,24 @@
 from typing import Any
 
 import jax
+import numpy as np
 
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
-from cpjax.pytree import check, is_traced
+from cpjax.pytree import Number, check, is_traced, numbers
+
+EXPRESSED = (
+    *("cart_mass", "pole_mass", "pole_length", "gravity", "pole_inertia", "cart_friction", "pivot_friction"),
+    *("torque_constant", "back_emf_constant", "resistance", "rotor_inertia", "viscous_friction"),
+    *("wheel_radius", "gear_ratio", "voltage_limit"),
+)
+"""Parameters of plant and motor that the bridges' own formulas hold."""
 
 UNTRACEABLE = "JAX cannot trace through another package"
 
 
 def known_plant(plant: Any) -> CartPole:
-    """`plant` with Python's floats for numbers.
+    """`plant` with Python's floats for numbers; a matrix of somebody's own motor stays an array.
 
     Raises:
       InputError: it is no CartPole, or JAX is tracing a number of it.
@@ -20,7 +28,13 @@ def known_plant(plant: Any) -> CartPole:
     if not isinstance(plant, CartPole):
         raise InputError("plant", plant, "a cpjax.CartPole")
     refuse_unknown("plant", plant)
-    return jax.tree.map(float, plant)
+    return jax.tree.map(lambda leaf: leaf if np.ndim(leaf) else float(leaf), plant)
+
+
+def unexpressed(part: Any) -> dict[str, Number]:
+    """The numbers of a plant or motor beyond `EXPRESSED` that are not neutral: no formula of a bridge holds them."""
+    declared = numbers(type(part)).items()
+    return {name: rule for name, rule in declared if name not in EXPRESSED and getattr(part, name) != rule.neutral}
 
 
 def refuse_unknown(name: str, tree: Any) -> None:

@@ -3,7 +3,7 @@
 import math
 from typing import Literal
 
-from cpjax.bridges.known import known_plant
+from cpjax.bridges.known import known_plant, unexpressed
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor
 from cpjax.pytree import Number
@@ -49,12 +49,17 @@ def model_xml(
       integrator: MuJoCo's name of it.
 
     Raises:
-      InputError: `plant` is no CartPole with cpjax's own motor and known numbers; dt is not positive.
+      InputError: the class of `plant` or of its motor is not cpjax's own; a parameter that the model does not hold is
+        not zero (or what is declared neutral); a number is not known; dt is not positive.
     """
     plant = known_plant(plant)
     motor = plant.motor
-    if type(motor) is not Motor:
-        raise InputError("plant.motor", motor, "a cpjax.Motor; of another, MuJoCo cannot be told")
+    for path, part, cls in (("plant", plant, CartPole), ("plant.motor", motor, Motor)):
+        if type(part) is not cls:
+            raise InputError(path, part, f"a cpjax.{cls.__name__}; this MuJoCo model cannot express any other class")
+        for name, rule in unexpressed(part).items():
+            allowed = f"{rule.neutral:g} [{rule.unit}]; this MuJoCo model cannot express any other"
+            raise InputError(f"{path}.{name}", getattr(part, name), allowed)
     turns = motor.gear_ratio / motor.wheel_radius  # rotor radians per metre
     numbers: dict[str, object] = {
         "dt": float(_STEP.normalise("dt", dt)),

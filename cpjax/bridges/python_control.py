@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from cpjax.bridges.known import UNTRACEABLE, known_plant, refuse_unknown
+from cpjax.bridges.known import UNTRACEABLE, known_plant, refuse_unknown, unexpressed
 from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import Law, ModalController, SingleLaw, as_controller
@@ -169,17 +169,24 @@ def state_feedback(gain: Any) -> StateFeedback:
 
 
 def _derivative(plant: CartPole, state: Vector, voltage: float) -> tuple[Any, ...]:
-    """`CartPole.vector_field` under the applied voltage [V], in Python's floats, which the plant must hold too."""
+    """`vector_field` of any plant under the applied voltage [V], as Python's floats, which the plant must hold too."""
     _, x_dot, theta, theta_dot = state.tolist()
-    force = plant.motor.force(voltage, x_dot)
-    x_ddot, theta_ddot = plant.acceleration(math.sin(theta), math.cos(theta), (x_dot, theta_dot), force)
-    return x_dot, x_ddot, theta_dot, theta_ddot
+    # What a plant or motor computes with JAX's functions comes out as arrays: without float64, as float32 ones.
+    with jax.enable_x64(True):
+        force = float(plant.motor.force(voltage, x_dot))
+        x_ddot, theta_ddot = plant.acceleration(math.sin(theta), math.cos(theta), (x_dot, theta_dot), force)
+        return x_dot, float(x_ddot), theta_dot, float(theta_ddot)
 
 
 def _saturation(motor: Motor) -> Callable[[float], float]:
     """`motor.saturate` for Python's floats; that of cpjax's own motor without a call into JAX. NaN stays NaN."""
-    if type(motor) is not Motor:
-        return lambda voltage: float(motor.saturate(voltage))
+    if type(motor) is not Motor or unexpressed(motor):
+
+        def saturate(voltage: float) -> float:
+            with jax.enable_x64(True):
+                return float(motor.saturate(voltage))
+
+        return saturate
     limit = float(motor.voltage_limit)
     return lambda voltage: max(min(voltage, limit), -limit)
 

@@ -30,7 +30,7 @@ from cpjax.controllers.protocol import Controller, as_controller
 from cpjax.design.lqr import lqr
 from cpjax.design.placement import place
 from cpjax.errors import InputError
-from cpjax.plant import CartPole, Motor, linearize
+from cpjax.plant import CartPole, Motor, linearize, with_parameters
 from cpjax.presets import PRESETS, preset
 from cpjax.pytree import Number, rules
 from cpjax.sim.integrators import INTEGRATORS
@@ -221,8 +221,7 @@ def build_plant(given: Mapping[str, Any]) -> CartPole:
         plant = io.load(base)
         if not isinstance(plant, CartPole):
             raise InputError("plant", base, "a file that holds a CartPole")
-    motor = {key: changes.pop(key) for key in list(changes) if key in rules(Motor)}
-    return dataclasses.replace(plant, **changes, motor=dataclasses.replace(plant.motor, **motor))
+    return with_parameters(plant, changes)
 
 
 def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:

@@ -33,7 +33,7 @@ class AngleGate:
     """Open within `half_angle` of upright: margin = cos(theta) - cos(size)."""
 
     half_angle: Scalar = number("rad", "angle from upright", above=0.0, at_most=math.pi)
-    hysteresis: Scalar = number("1", "relative widening of the way out", default=0.0, at_least=0.0)
+    hysteresis: Scalar = number("1", "relative widening of the way out", default=0.0, at_least=0.0, typical=0.1)
 
     def __post_init__(self) -> None:
         _check_widened_angle("AngleGate", self.half_angle, self.hysteresis)
@@ -55,7 +55,7 @@ class AngleRateGate:
 
     half_angle: Scalar = number("rad", "angle from upright, at rest", above=0.0, at_most=math.pi)
     rate: Scalar = number("rad/s", "angular rate, upright", above=0.0)
-    hysteresis: Scalar = number("1", "relative widening of the way out", default=0.0, at_least=0.0)
+    hysteresis: Scalar = number("1", "relative widening of the way out", default=0.0, at_least=0.0, typical=0.1)
 
     def __post_init__(self) -> None:
         _check_widened_angle("AngleRateGate", self.half_angle, self.hysteresis)
@@ -82,7 +82,7 @@ class LyapunovGate:
 
     P: Array = matrix((4, 4), "per product of states", "symmetric weight, such as LQR's P", symmetric=True)
     level: Scalar = number("1", "s' P s up to which the gate is open", above=0.0)
-    hysteresis: Scalar = number("1", "relative widening of the way out", default=0.0, at_least=0.0)
+    hysteresis: Scalar = number("1", "relative widening of the way out", default=0.0, at_least=0.0, typical=0.1)
     reference: State = part("the middle of the level set, a State", *NAMES, default=UPRIGHT)
 
     def __post_init__(self) -> None:

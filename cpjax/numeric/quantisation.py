@@ -17,8 +17,8 @@ def quantize(value: Scalar, step: Scalar, *, derivative: QuantiserDerivative) ->
 
     Args:
       step: above 0, in the unit of `value`.
-      derivative: in `value`. "zero" is the true one wherever it exists, and tells a tuner nothing. "straight_through" is
-        1: the derivative of the mean of the result, if where the value lies between two steps is as good as random.
+      derivative: in `value`. "zero" is the true one wherever it exists, and tells a tuner nothing. "straight_through"
+        is 1: the derivative of the mean of the result, if where the value lies between two steps is as good as random.
         (The derivative in `step` is that of the result, `result / step`, for either.)
 
     Raises:

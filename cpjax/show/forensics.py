@@ -9,10 +9,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cpjax.plant import CartPole, Motor
-from cpjax.pytree import Number, rules
+from cpjax.plant import CartPole, parameters_of, with_parameters
 from cpjax.study.forensics import Direction, GainAudit
-from cpjax.study.plant_fit import EXPLAINED, Fit, changed
+from cpjax.study.plant_fit import EXPLAINED, Fit
 
 FIT_HEADER = ("changed", "to", "worst residual", "force per volt [N/V]", "total damping [N s/m]", "starts that agree")
 DIRECTION_HEADER = ("combination of relative changes", "sensitivity", "known to")
@@ -22,8 +21,8 @@ _ROUGHLY = 5.0  # sensitivity at which a change of 10 % is half a last digit
 
 def fit_cells(fit: Fit, plant: CartPole) -> list[str]:
     """One fit as text: with it, two numbers of the linear model that the motor's parameters only enter through."""
-    units = {n: r.unit for cls in (CartPole, Motor) for n, r in rules(cls).items() if isinstance(r, Number)}
-    with_it = changed(plant, dict(zip(fit.parameters, fit.values, strict=True)))
+    units = {name: rule.unit for name, rule in parameters_of(plant).items()}
+    with_it = with_parameters(plant, dict(zip(fit.parameters, fit.values, strict=True)))
     return [
         ", ".join(fit.parameters),
         ", ".join(f"{v:.5g} {units[n]}".removesuffix(" 1") for n, v in zip(fit.parameters, fit.values, strict=True)),

@@ -16,9 +16,9 @@ import numpy as np
 
 from cpjax import io
 from cpjax.errors import InputError
-from cpjax.plant import CartPole
+from cpjax.plant import CartPole, with_parameters
 from cpjax.pytree import check
-from cpjax.study.plant_fit import PARAMETERS, Fit, Progress, changed, fit_all, linearised, random_starts, scale_of
+from cpjax.study.plant_fit import PARAMETERS, Fit, Progress, fit_all, linearised, random_starts, scale_of
 from cpjax.study.printed_gains import PrintedGain
 
 
@@ -124,7 +124,7 @@ def audit_gains(
         progress(len(sets), len(sets), "singular values")
     audit = GainAudit(tuple(unchanged.tolist()), tuple(fits), (), plant)
     chosen = audit.simplest[0] if audit.simplest else min(fits, key=lambda fit: fit.worst)
-    found = changed(plant, dict(zip(chosen.parameters, chosen.values, strict=True)))
+    found = with_parameters(plant, dict(zip(chosen.parameters, chosen.values, strict=True)))
     return dataclasses.replace(audit, directions=_directions(given, found, names), plant=found)
 
 

@@ -14,7 +14,7 @@ from cpjax import paper
 from cpjax.controllers import EnergySwingUp
 from cpjax.controllers.hybrid import without_design
 from cpjax.numeric.pareto import nondominated
-from cpjax.plant import CartPole
+from cpjax.plant import CartPole, with_parameters
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.sweep import sweep
 from cpjax.starts import sample_starts
@@ -93,7 +93,7 @@ class Judge:
 
     def plant_at(self, supply: Any) -> CartPole:
         """The plant at a supply [V]."""
-        return dataclasses.replace(self._plant, motor=dataclasses.replace(self._plant.motor, voltage_limit=supply))
+        return with_parameters(self._plant, {"voltage_limit": supply})
 
     def free_at(self, supply: Any) -> FreeParameters:
         """The free parameters of controllers whose law knows this supply [V]."""

@@ -14,15 +14,12 @@ from cpjax.controllers.protocol import Controller, Law
 from cpjax.design.lqr import lqr
 from cpjax.design.placement import place_polynomial
 from cpjax.errors import InputError
-from cpjax.plant import CartPole, linearize
-from cpjax.pytree import Number, rules
+from cpjax.plant import CartPole, linearize, with_parameters
+from cpjax.pytree import numbers
 
 Numbers: TypeAlias = np.ndarray[Any, Any]
 Build: TypeAlias = Callable[[Mapping[str, jax.Array]], tuple[CartPole, Controller | Law]]
 """Plant and controller of parameters. Traced."""
-
-_PLANT = ("cart_mass", "pole_mass", "pole_length", "cart_friction", "pivot_friction")
-_SCALES = {"cart_friction": 0.1, "pivot_friction": 0.01, "hysteresis": 0.1}
 
 
 class Parametrisation(NamedTuple):
@@ -36,9 +33,10 @@ class Parametrisation(NamedTuple):
 def parametrise(plant: CartPole, controller: Hybrid) -> Parametrisation:
     """The numbers of a closed loop by name: of the plant, the swing-up law, the regulator and the gate.
 
-    The regulator's are those of its design, the diagonal weights Q (4,) and R, or the characteristic polynomial of the
-    four poles; or, without a design or with a full Q, its gain K. The law's model of the plant, for which a gain is
-    designed, does not change with the plant.
+    The plant's are those of its own that are declared uncertain, and the supply's limit if it has one. The regulator's
+    are those of its design, the diagonal weights Q (4,) and R, or the characteristic polynomial of the four poles; or,
+    without a design or with a full Q, its gain K. The law's model of the plant, for which a gain is designed, does not
+    change with the plant.
 
     Raises:
       InputError: a controller that is not a Hybrid with a StateFeedback.
@@ -46,13 +44,12 @@ def parametrise(plant: CartPole, controller: Hybrid) -> Parametrisation:
     if not isinstance(controller, Hybrid) or not isinstance(controller.regulator, StateFeedback):
         raise InputError("controller", controller, "a cpjax.Hybrid with a cpjax.StateFeedback")
     law, gate, reference = controller.swing_up, controller.gate, controller.regulator.reference
-    parameters: dict[str, Any] = {name: float(getattr(plant, name)) for name in _PLANT}
+    of_plant = {name: rule for name, rule in numbers(type(plant)).items() if rule.uncertain}
+    parameters: dict[str, Any] = {name: float(getattr(plant, name)) for name in of_plant}
     if math.isfinite(float(plant.motor.voltage_limit)):
         parameters["voltage_limit"] = float(plant.motor.voltage_limit)
-    of_law, of_gate = (
-        [name for name, rule in rules(type(part)).items() if isinstance(rule, Number) and not name.startswith("kick")]
-        for part in (law, gate)
-    )
+    of_law = [name for name in numbers(type(law)) if not name.startswith("kick")]
+    of_gate = numbers(type(gate))
     of_law = [name for name in of_law if float(getattr(law, name)) != 0.0]
     parameters |= {name: float(getattr(law, name)) for name in of_law}
     parameters |= {name: float(getattr(gate, name)) for name in of_gate}
@@ -70,13 +67,17 @@ def parametrise(plant: CartPole, controller: Hybrid) -> Parametrisation:
             K = lqr(A, B, jnp.diag(p["Q"]), p["R"]).K
         else:
             K = place_polynomial(A, B, p["polynomial"]) if "polynomial" in p else p["K"][None]
-        motor = dataclasses.replace(plant.motor, **{n: p[n] for n in ("voltage_limit",) if n in p})
-        changed = dataclasses.replace(plant, **{n: p[n] for n in _PLANT}, motor=motor)
+        changed = with_parameters(plant, {n: p[n] for n in (*of_plant, "voltage_limit") if n in p})
         swing_up: Any = dataclasses.replace(law, **{n: p[n] for n in of_law})  # type: ignore[type-var]  # a dataclass
         region: Any = dataclasses.replace(gate, **{n: p[n] for n in of_gate})  # type: ignore[type-var]  # a dataclass
         return changed, Hybrid(swing_up, StateFeedback(K, reference), region)
 
-    scales = {name: scale for name, scale in _SCALES.items() if parameters.get(name) == 0.0}
+    scales = {
+        name: rule.size(owner, "change")
+        for owner, of_owner in ((plant, of_plant), (gate, of_gate))
+        for name, rule in of_owner.items()
+        if parameters[name] == 0.0
+    }
     return Parametrisation(build, parameters, scales)
 
 

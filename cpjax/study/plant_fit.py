@@ -15,17 +15,13 @@ import numpy as np
 from jax import lax
 
 from cpjax.numeric.small_matrices import linear_solve
-from cpjax.plant import CartPole, Motor
-from cpjax.pytree import Number, cast, rules
+from cpjax.plant import CartPole, Motor, parameter, parameters_of, with_parameters
+from cpjax.pytree import cast, numbers
 from cpjax.study.printed_gains import PrintedGain
 
-PARAMETERS = tuple(
-    name
-    for cls in (CartPole, Motor)
-    for name, rule in rules(cls).items()
-    if isinstance(rule, Number) and name != "voltage_limit"
-)
-"""Every number of a plant that its linear model may depend on."""
+PARAMETERS = tuple(name for name, rule in numbers(CartPole, Motor).items() if rule.linear and rule.scales)
+"""Every number of a plant that its linear model may depend on, but for those that not every positive factor leaves in
+their range: a fit multiplies by any."""
 
 EXPLAINED = 1.0
 """Worst residual, in units of the last digit, up to which gains count as explained: rounding twice is 1.0."""
@@ -63,30 +59,9 @@ class Fit:
         return self.worst <= EXPLAINED
 
 
-def changed(plant: CartPole, changes: Mapping[str, Any]) -> CartPole:
-    """The plant with some of its or its motor's parameters changed."""
-    motor = {key: value for key, value in changes.items() if key in rules(Motor)}
-    own = {key: value for key, value in changes.items() if key not in motor}
-    return dataclasses.replace(plant, **own, motor=dataclasses.replace(plant.motor, **motor))
-
-
-def value_of(plant: CartPole, name: str) -> float:
-    """A parameter of the plant or of its motor."""
-    return float(getattr(plant.motor if name in rules(Motor) else plant, name))
-
-
 def scale_of(plant: CartPole, name: str) -> float:
-    """The parameter's value; where it is zero, one at which it would matter on this plant."""
-    swing = float(plant.pole_mass) * float(plant.pole_length) ** 2
-    typical = {
-        "pole_inertia": swing,
-        "cart_friction": float(plant.motor.damping),
-        "viscous_friction": float(plant.motor.damping) * (plant.motor.wheel_radius / plant.motor.gear_ratio) ** 2,
-        "pivot_friction": swing * math.sqrt(float(plant.gravity) / float(plant.pole_length)),
-        "rotor_inertia": float(plant.cart_mass) * (plant.motor.wheel_radius / plant.motor.gear_ratio) ** 2,
-        "back_emf_constant": float(plant.motor.torque_constant),
-    }
-    return value_of(plant, name) or float(typical[name]) or 1.0
+    """The parameter's value; where it is zero, its typical size on this plant."""
+    return float(parameter(plant, name)) or parameters_of(plant)[name].size(plant) or 1.0
 
 
 def _residuals(prints: Sequence[PrintedGain], plant: CartPole) -> jax.Array:
@@ -101,7 +76,7 @@ def _with_derivatives(
     """Residuals (4 gains), and their derivatives (4 gains, n) by x (n,), on the plant changed to `values(x)`."""
 
     def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        r = _residuals(prints, changed(plant, values(x)))
+        r = _residuals(prints, with_parameters(plant, values(x)))
         return r, r
 
     J, r = jax.jacfwd(twice, has_aux=True)(x)
@@ -126,7 +101,7 @@ def _compiled_linearisation(
 
 def _numbers(plant: CartPole) -> tuple[CartPole, jax.Array]:
     """The plant with arrays for numbers, and the values of all `PARAMETERS`, of one dtype."""
-    numbers = jnp.asarray([value_of(plant, name) for name in PARAMETERS])
+    numbers = jnp.asarray([float(parameter(plant, name)) for name in PARAMETERS])
     return cast(plant, numbers.dtype), numbers
 
 

@@ -15,12 +15,13 @@ from scipy.signal import place_poles
 
 import cpjax
 from cpjax import CartPole, InputError, Motor, io, linearize, paper
+from cpjax.plant import with_parameters
 from cpjax.pytree import cast
 from cpjax.show.figures import png
 from cpjax.show.forensics import direction_cells, findings, fit_cells, picture, shown_fits
 from cpjax.study import forensics, plant_fit
 from cpjax.study.forensics import Direction, GainAudit, audit_gains, document, write
-from cpjax.study.plant_fit import PARAMETERS, Fit, changed, least_squares
+from cpjax.study.plant_fit import PARAMETERS, Fit, least_squares
 from cpjax.study.printed_gains import PrintedGain, printed_in_the_paper
 
 APPENDIX = paper.appendix_plant()
@@ -50,7 +51,7 @@ def value_of(plant, name):
 
 
 def off(plant, names, factors=(1.3, 0.8)):
-    return changed(plant, {n: f * value_of(plant, n) for n, f in zip(names, factors, strict=True)})
+    return with_parameters(plant, {n: f * value_of(plant, n) for n, f in zip(names, factors, strict=True)})
 
 
 @pytest.fixture(scope="module")
@@ -168,7 +169,7 @@ def test_the_same_seed_gives_the_same_audit(papers):
 def test_the_residuals_are_scipys_gains_less_the_printed_ones_in_units_of_the_last_digit(papers):
     design = paper.Q, paper.R, paper.POLES
     printed = np.concatenate([paper.PRINTED_GAINS["placement"], paper.PRINTED_GAINS["lqr"]])
-    plants = [changed(APPENDIX, dict(zip(f.parameters, f.values, strict=True))) for f in papers.fits]
+    plants = [with_parameters(APPENDIX, dict(zip(f.parameters, f.values, strict=True))) for f in papers.fits]
     for plant, residuals in zip(
         [APPENDIX, *plants], [papers.unchanged, *(f.residuals for f in papers.fits)], strict=True
     ):
@@ -186,7 +187,7 @@ def test_no_small_change_of_a_fitted_parameter_fits_better(papers):
         for name, value in zip(fit.parameters, fit.values, strict=True):
             for factor in (0.999, 0.99999, 1.00001, 1.001):
                 values = {**dict(zip(fit.parameters, fit.values, strict=True)), name: value * factor}
-                moved = (scipys_gains(changed(APPENDIX, values), *design) - printed) / 0.01
+                moved = (scipys_gains(with_parameters(APPENDIX, values), *design) - printed) / 0.01
                 # SciPy's gains have 9 good digits, and a parameter of no consequence changes fewer.
                 assert np.sum(moved**2) > least * (1.0 - 1e-9), (name, factor)
 
@@ -245,7 +246,7 @@ def test_of_two_parameters_that_act_as_a_ratio_the_ratio_is_recovered_and_neithe
     assert [fit.parameters for fit in sorted(audit.simplest, key=lambda f: f.parameters)] == [names[1:], names[:1]]
     truth = value_of(rig, names[0]) / value_of(rig, names[1])
     for fit in audit.fits:
-        plant = changed(off(rig, names, (1.3, 1.1)), dict(zip(fit.parameters, fit.values, strict=True)))
+        plant = with_parameters(off(rig, names, (1.3, 1.1)), dict(zip(fit.parameters, fit.values, strict=True)))
         assert value_of(plant, names[0]) / value_of(plant, names[1]) == pytest.approx(truth, rel=1e-3)
         assert abs(value_of(plant, names[0]) / value_of(rig, names[0]) - 1.0) > 0.05
     known, unknown = audit.directions
@@ -258,7 +259,7 @@ def test_of_two_parameters_that_act_as_a_ratio_the_ratio_is_recovered_and_neithe
 
 def test_a_parameter_that_is_zero_in_the_plant_is_found_where_the_rig_has_one():
     rig, names = dataclasses.replace(rough_plant(), pole_inertia=0.0), ("cart_friction", "pole_inertia")
-    without = changed(rig, {"cart_friction": 0.0})
+    without = with_parameters(rig, {"cart_friction": 0.0})
     audit = audit_gains(prints_of(rig), without, parameters=names, **SMALL)
     [fit] = audit.simplest
     assert fit.parameters == ("cart_friction",)
@@ -289,7 +290,7 @@ def test_the_sensitivities_are_how_far_scipys_gains_move(plant, count):
     @jax.jit
     @jax.vmap
     def models(change):
-        return linearize(changed(plant, dict(zip(names, sizes * (1.0 + change), strict=True))))
+        return linearize(with_parameters(plant, dict(zip(names, sizes * (1.0 + change), strict=True))))
 
     def moved(changes):
         """Gains in units of the last digit, for relative changes (many, names)."""
@@ -509,7 +510,7 @@ def test_a_line_of_the_table_has_the_fits_numbers(papers):
     assert cells[0] == "torque_constant, back_emf_constant"
     assert cells[1] == f"{pair.values[0]:.5g} N m/A, {pair.values[1]:.5g} V s/rad"
     assert cells[2:] == [f"{pair.worst:.3g}", "1.03846", "1.93006", "100 %"]
-    rubbing = changed(APPENDIX, {"cart_friction": 0.25})
+    rubbing = with_parameters(APPENDIX, {"cart_friction": 0.25})
     assert fit_cells(pair, rubbing)[4] == "2.18006"
 
 
@@ -563,7 +564,7 @@ def test_the_pictures_circles_are_the_pairs_that_explain():
 
 
 def test_changing_a_plant_changes_its_motor_too_and_nothing_else():
-    plant = changed(APPENDIX, {"pole_mass": 0.25, "resistance": 2.0})
+    plant = with_parameters(APPENDIX, {"pole_mass": 0.25, "resistance": 2.0})
     motor = Motor(1.25, 1.0, 2.0, 7e-6, 1e-5)
     for name in (*PARAMETERS, "voltage_limit"):
         assert value_of(plant, name) == value_of(CartPole(pole_mass=0.25, motor=motor), name)
