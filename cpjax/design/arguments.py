@@ -88,6 +88,41 @@ def columns(name: str, matrix: jax.Array, n: int) -> jax.Array:
     return matrix
 
 
+def rows(name: str, matrix: jax.Array, n: int) -> jax.Array:
+    """Returns the outputs' matrix, or a gain, as (p, n), p at least 1; a plain vector (n,) is taken as one row.
+
+    Raises:
+      InputError: another shape.
+    """
+    if matrix.shape == (n,):
+        return matrix[None, :]
+    if matrix.ndim != 2 or matrix.shape[1] != n or matrix.shape[0] == 0:
+        raise InputError(name, f"array of shape {matrix.shape}", f"of shape (p, {n}); batches go through jax.vmap")
+    return matrix
+
+
+def gain_matrix(name: str, matrix: jax.Array, m: int, n: int) -> jax.Array:
+    """Returns the gain of m inputs as (m, n); a plain vector (n,) is taken as that of one input.
+
+    Raises:
+      InputError: another shape.
+    """
+    matrix = matrix[None, :] if m == 1 and matrix.shape == (n,) else matrix
+    shaped(name, matrix, (m, n))
+    return matrix
+
+
+def input_weight(name: str, matrix: jax.Array, m: int) -> jax.Array:
+    """Returns the weight of m inputs as (m, m); a number is taken as that of one input.
+
+    Raises:
+      InputError: another shape.
+    """
+    matrix = matrix.reshape(1, 1) if matrix.shape == () else matrix
+    shaped(name, matrix, (m, m))
+    return matrix
+
+
 def column(name: str, matrix: jax.Array, n: int) -> jax.Array:
     """A single input's matrix as (n, 1); a plain vector (n,) is welcome.
 

@@ -23,7 +23,7 @@ import numpy as np
 from jax import lax
 from jax.scipy.linalg import expm
 
-from cpjax.design.arguments import matrices, shaped, square
+from cpjax.design.arguments import columns, input_weight, matrices, shaped, square
 from cpjax.errors import InputError
 from cpjax.numeric.small_matrices import product, symmetric, transpose
 from cpjax.pytree import Scalar, is_traced
@@ -61,7 +61,7 @@ def discretize(A: Any, B: Any, period: Scalar) -> SampledModel:
 
     Args:
       A: (n, n) [1/s].
-      B: (n, m), any m.
+      B: (n, m), or (n,) for one input.
       period: above 0 [s].
 
     Raises:
@@ -81,9 +81,9 @@ def discretize_cost(A: Any, B: Any, Q: Any, R: Any, period: Scalar) -> SampledCo
 
     Args:
       A: (n, n) [1/s].
-      B: (n, m), any m.
+      B: (n, m), or (n,) for one input.
       Q: (n, n).
-      R: (m, m).
+      R: (m, m), or a number for one input.
       period: above 0 [s].
 
     Raises:
@@ -92,7 +92,7 @@ def discretize_cost(A: Any, B: Any, Q: Any, R: Any, period: Scalar) -> SampledCo
     A, B, period, Q, R = _arguments(A, B, period, Q=Q, R=R)
     n, m = B.shape
     shaped("Q", Q, (n, n))
-    shaped("R", R, (m, m))
+    R = input_weight("R", R, m)
     return _finite(period, _cost(A, B, Q, R, period))
 
 
@@ -159,10 +159,7 @@ def _repeat(function: Callable[[T], T], value: T, times: jax.Array) -> T:
 def _arguments(A: Any, B: Any, period: Any, **weights: Any) -> list[jax.Array]:
     A, B, period, *others = matrices(A=A, B=B, period=period, **weights)
     n = square("A", A)
-    if B.ndim != 2 or B.shape[0] != n or B.shape[1] == 0:
-        raise InputError(
-            "B", f"array of shape {B.shape}", f"of shape ({n}, m), m at least 1; batches go through jax.vmap"
-        )
+    B = columns("B", B, n)
     shaped("period", period, ())
     if not is_traced(period) and not period > 0:
         raise InputError("period", float(period), "a finite number above 0 [s]")

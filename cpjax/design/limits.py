@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from cpjax.design.arguments import MatrixLike, matrices, shaped, square
+from cpjax.design.arguments import MatrixLike, columns, gain_matrix, matrices, shaped, square
 from cpjax.design.lyapunov import lyapunov
 from cpjax.errors import InputError
 from cpjax.numeric.small_matrices import is_positive_definite, linear_solve
@@ -25,43 +25,51 @@ _RATE = 3
 
 
 def demanded_voltage(K: MatrixLike, angle: Scalar) -> jax.Array:
-    """|u| [V] that the gain K (1, 4) asks for at rest, cart in place, `angle` [rad] from upright."""
+    """Returns |u| [V] that the gain K (1, 4) or (4,) asks for at rest, cart in place, `angle` [rad] from upright."""
     (K,) = matrices(K=K)
-    shaped("K", K, (1, 4))
+    K = gain_matrix("K", K, 1, 4)
     return jnp.abs(K[0, _THETA] * jnp.asarray(angle, dtype=K.dtype))
 
 
 def saturation_angle(K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
-    """Angle [rad] from upright beyond which, at rest and with the cart in place, the gain K (1, 4) asks for more than
-    `voltage_limit` [V]; infinite for a gain that ignores the angle.
+    """Returns the angle [rad] from upright beyond which, at rest and with the cart in place, the gain K (1, 4) or (4,)
+    asks for more than `voltage_limit` [V]; infinite for a gain that ignores the angle.
     """
     (K,) = matrices(K=K)
-    shaped("K", K, (1, 4))
+    K = gain_matrix("K", K, 1, 4)
     return _limit("voltage_limit", "V", voltage_limit, K, infinite=True) / jnp.abs(K[0, _THETA])
 
 
 def lyapunov_function(A: MatrixLike, B: MatrixLike, K: MatrixLike, Q: MatrixLike) -> jax.Array:
-    """P (n, n) for which d/dt s' P s = -s' Q s under s' = (A - B K) s.
+    """Returns P (n, n) for which d/dt s' P s = -s' Q s under s' = (A - B K) s.
+
+    Args:
+      A: (n, n).
+      B: (n, m), or (n,) for one input.
+      K: (m, n), or (n,) for one input.
+      Q: (n, n).
 
     Raises:
       InputError: shapes that do not fit, or a concrete closed loop that is not stable. Under jit P is NaN instead.
     """
     A, B, K, Q = matrices(A=A, B=B, K=K, Q=Q)
     n = square("A", A)
-    shaped("B", B, (n, B.shape[-1] if B.ndim == 2 else 1))
-    shaped("K", K, (B.shape[1], n))
+    B = columns("B", B, n)
+    K = gain_matrix("K", K, B.shape[1], n)
     return lyapunov(A - B @ K, Q)
 
 
 def level_within_voltage(P: MatrixLike, K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
     """The largest level at which |K s| stays within `voltage_limit` [V] wherever s' P s is at most that level.
 
+    P is (n, n), K (1, n) or (n,).
+
     Raises:
       InputError: shapes that do not fit, a concrete P that is not positive definite, or a limit that is not above 0.
     """
     P, K = matrices(P=P, K=K)
     P = _positive_definite("P", P)
-    shaped("K", K, (1, square("P", P)))
+    K = gain_matrix("K", K, 1, square("P", P))
     limit = _limit("voltage_limit", "V", voltage_limit, P, infinite=True)
     return limit * limit / (K @ linear_solve(P, K.T))[0, 0]
 

@@ -9,7 +9,7 @@ from cpjax.design.riccati import solve_care, solve_dare
 
 
 class LinearQuadratic(NamedTuple):
-    """The gain of u = -K s, and the Riccati solution: s' P s is what it costs to come to rest from s."""
+    """The gain of u = -K s, and the Riccati solution: s' P s is the least cost of coming to rest from s."""
 
     K: jax.Array
     """Shape (m, n)."""
@@ -18,7 +18,10 @@ class LinearQuadratic(NamedTuple):
 
 
 def lqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> LinearQuadratic:
-    """The gain that minimises the integral of s' Q s + 2 s' N u + u' R u under s' = A s + B u.
+    """Returns the gain that stabilises s' = A s + B u and minimises the integral of s' Q s + 2 s' N u + u' R u.
+
+    (A, B) must be stabilisable, and every mode of A on the imaginary axis observable through Q. A mode elsewhere needs
+    no weight: without one, a stable mode keeps its eigenvalue, and an unstable one is mirrored at the axis.
 
     K depends on the ratio of the weights alone: (c Q, c R, c N) gives the same K for any c > 0, and c P.
 
@@ -37,6 +40,9 @@ def lqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLik
 
 
 def dlqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> LinearQuadratic:
-    """The gain that minimises the sum of s' Q s + 2 s' N u + u' R u under s[k+1] = A s[k] + B u[k]; as `lqr`."""
+    """Returns the gain that stabilises s[k+1] = A s[k] + B u[k] and minimises the sum of s' Q s + 2 s' N u + u' R u.
+
+    As `lqr`, with the unit circle in place of the imaginary axis.
+    """
     P, K, _ = solve_dare(A, B, Q, R, N)
     return LinearQuadratic(K, P)

@@ -22,8 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from cpjax.design.arguments import column, matrices, shaped, square
-from cpjax.errors import InputError
+from cpjax.design.arguments import column, columns, gain_matrix, matrices, square
 
 
 class Margins(NamedTuple):
@@ -79,11 +78,8 @@ def closed_loop_poles(A: Any, B: Any, K: Any) -> jax.Array:
     """
     A, B, K = matrices(A=A, B=B, K=K)
     n = square("A", A)
-    B = B[:, None] if B.ndim == 1 else B
-    if B.ndim != 2 or B.shape[0] != n:
-        raise InputError("B", f"array of shape {B.shape}", f"of shape ({n}, inputs) or ({n},)")
-    K = K[None, :] if K.ndim == 1 else K
-    shaped("K", K, (B.shape[1], n))
+    B = columns("B", B, n)
+    K = gain_matrix("K", K, B.shape[1], n)
     return jnp.sort(jnp.linalg.eigvals(A - B @ K))
 
 
@@ -200,9 +196,7 @@ def _single_input(A: Any, B: Any, K: Any) -> list[jax.Array]:
     A, B, K = matrices(A=A, B=B, K=K)
     n = square("A", A)
     B = column("B", B, n)
-    K = K[None, :] if K.ndim == 1 else K
-    shaped("K", K, (1, n))
-    return [A, B[:, 0], K[0]]
+    return [A, B[:, 0], gain_matrix("K", K, 1, n)[0]]
 
 
 def _resolvent(A: jax.Array, n: int) -> tuple[jax.Array, list[jax.Array]]:

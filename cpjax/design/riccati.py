@@ -3,14 +3,20 @@
     A' P + P A - K' R K + Q = 0                    K = R^-1 (B' P + N')
     A' P A - P - K' (R + B' P B) K + Q = 0         K = (R + B' P B)^-1 (B' P A + N')
 
-and of their solutions the one under which u = -K s stabilises and minimises the integral, or the sum, of
-s' Q s + 2 s' N u + u' R u.
+and of their solutions the stabilising one, under which all eigenvalues of A - B K are stable. Of all u that bring s to
+rest, u = -K s minimises the integral, or the sum, of s' Q s + 2 s' N u + u' R u.
+
+It exists if and only if (A, B) is stabilisable and every mode of A on the boundary of stability (the imaginary axis, or
+the unit circle) is observable through Q; with N, of A - B R^-1 N' through Q - N R^-1 N'. The other modes need no
+weight: without one, those that are stable stay where they are, and those that are not are mirrored at the boundary.
 
 Method: a structure-preserving doubling algorithm (Anderson, 1978; Chu, Fan and Lin, 2005) finds P to most of its
 digits. Newton's method (Kleinman, 1964; Hewer, 1971) corrects it, with the residual, P and K in double-word arithmetic,
 so that what is returned is the rounding of the exact solution, until the condition of the problem is beyond all floats.
-Each correction is a Lyapunov or Stein equation, and solving it proves the closed loop stable. Where P and the solution
-of the dual equation are so large that doubling loses all digits, it is done again in double-word arithmetic too.
+Each correction is a Lyapunov or Stein equation, and solving it proves the closed loop stable. Where this fails, it is
+done again, with doubling in double-word arithmetic and with a weight at the end of the horizon: P and the solution of
+the dual equation may be so large that doubling lost all digits, or Q may not see an unstable mode, in which case
+doubling without that weight finds a solution that does not stabilise.
 
 Derivatives come from the same equations (Kao and Hennequin, 2020): with dA, dB, dQ, dN, dR and D = dA - dB K,
 
@@ -27,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from cpjax.design.arguments import MatrixLike, columns, matrices, shaped, square
+from cpjax.design.arguments import MatrixLike, columns, input_weight, matrices, shaped, square
 from cpjax.design.lyapunov import Sum, cayley_shift, lyapunov_equation, stein_equation, sum_continuous, sum_discrete
 from cpjax.errors import InputError
 from cpjax.numeric import double_word as dw
@@ -66,21 +72,25 @@ class RiccatiSolution(NamedTuple):
 
 
 def care(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> jax.Array:
-    """P (n, n) of the continuous-time algebraic Riccati equation; see `solve_care`."""
+    """Returns P (n, n) of the continuous-time algebraic Riccati equation; see `solve_care`."""
     return solve_care(A, B, Q, R, N).P
 
 
 def dare(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> jax.Array:
-    """P (n, n) of the discrete-time algebraic Riccati equation; see `solve_dare`."""
+    """Returns P (n, n) of the discrete-time algebraic Riccati equation; see `solve_dare`."""
     return solve_dare(A, B, Q, R, N).P
 
 
 def solve_care(
     A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None
 ) -> RiccatiSolution:
-    """The stabilising solution of the continuous-time Riccati equation, with its gain.
+    """Solves the continuous-time Riccati equation for its stabilising solution, with its gain.
 
     Differentiable to any order in all arguments. Only the symmetric parts of Q and R count.
+
+    Q may be singular, or zero: only modes of A on the imaginary axis must be observable through it (on the unit circle,
+    in discrete time). An unobservable stable mode keeps its eigenvalue; an unobservable unstable one is mirrored. P is
+    then singular.
 
     Args:
       A: (n, n).
@@ -91,8 +101,8 @@ def solve_care(
 
     Raises:
       InputError: shapes that do not fit, a concrete Q, R or N that is not as above, a concrete pair (A, B) that is not
-        stabilisable or (A, Q) that is not detectable, or a problem too ill-conditioned for its dtype. Under jit the
-        solution is NaN then, and its `found` is False.
+        stabilisable, a mode of a concrete A on the imaginary axis that is not observable through Q, or a problem too
+        ill-conditioned for its dtype. Under jit the solution is NaN then, and its `found` is False.
     """
     return _solved(_continuous, "continuous", A, B, Q, R, N)
 
@@ -100,7 +110,10 @@ def solve_care(
 def solve_dare(
     A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None
 ) -> RiccatiSolution:
-    """The stabilising solution of the discrete-time Riccati equation, with its gain; as `solve_care`."""
+    """Solves the discrete-time Riccati equation for its stabilising solution, with its gain; as `solve_care`.
+
+    R is positive definite here too: that R + B' P B is, is not enough.
+    """
     return _solved(_discrete, "discrete", A, B, Q, R, N)
 
 
@@ -113,15 +126,14 @@ def _solved(
     B = columns("B", B, n)
     m = B.shape[1]
     shaped("Q", Q, (n, n))
-    R = R.reshape(1, 1) if R.shape == () else R
-    shaped("R", R, (m, m))
+    R = input_weight("R", R, m)
     N = columns("N", cross[0], n) if cross else jnp.zeros((n, m), dtype=A.dtype)
     shaped("N", N, (n, m))
     problem = (A, B, Q, R, N)
     concrete = not any(is_traced(x) for x in problem)
     if concrete:
         room = 16.0 * n * float(np.finfo(A.dtype).eps)
-        _check_weights(*(np.asarray(x, dtype=np.float64) for x in (Q, R, N)), room=room)
+        _check_weights(time, *(np.asarray(x, dtype=np.float64) for x in (Q, R, N)), room=room)
     P, K = equation(A, B, 0.5 * (Q + Q.T), 0.5 * (R + R.T), N)
     found = jnp.all(jnp.isfinite(P))
     if concrete and not found:
@@ -212,17 +224,38 @@ def _found(
     gain: Callable[[DoubleWord], tuple[DoubleWord, DoubleWord]],
     valid: jax.Array,
 ) -> tuple[Matrix, Matrix]:
-    """P and K, NaN where there are none. The second attempt is made only if some member of the batch needs it."""
+    """Returns P and K, NaN where there are none. The second attempt is made only if a member of the batch needs it."""
     P, K = _corrected(_double(problem, _PLAIN), correction, gain, valid)
     finite = jnp.all(jnp.isfinite(problem.E + problem.G + problem.H), axis=(0, 1))
     missed = valid & finite & ~jnp.all(jnp.isfinite(P), axis=(0, 1))
 
     def again() -> tuple[Matrix, Matrix]:
-        more = _corrected(_double(problem, _ACCURATE), correction, gain, missed)
+        start = _double(problem, _ACCURATE, _terminal_weight(problem))
+        more = _corrected(start, correction, gain, missed)
         return jnp.where(missed, more[0], P), jnp.where(missed, more[1], K)
 
     found: tuple[Matrix, Matrix] = lax.cond(jnp.any(missed), again, lambda: (P, K))
     return found
+
+
+def _terminal_weight(problem: _Doubled) -> Matrix:
+    """Returns S (n, n) of the cost s' S s at the end of the horizon: diagonal, above 0 where an input moves the state.
+
+    Doubling takes the horizon to infinity. Without S it finds the least positive semidefinite solution, under which an
+    unstable mode that Q does not see stays unstable; with an S that weighs such modes, the stabilising one (Chan,
+    Goodwin and Sin, 1984). The size of S matters little. It is taken from a Gramian of the inputs, which gives it the
+    units of P whatever those of the states are; growing powers of E are scaled down.
+    """
+    E, G, _, _ = problem
+    identity = identity_like(E)
+    trace, trace_of_square = (jnp.sum(x * identity, axis=(0, 1)) for x in (E, product(E, E)))
+    growth = jnp.maximum(jnp.maximum(trace * trace, jnp.abs(trace_of_square)), 1.0)
+    total = term = G
+    for _ in range(E.shape[0] - 1):
+        term = product(E, term, transpose(E)) / growth
+        total = total + term
+    weight = 1.0 / diagonal(total)
+    return identity * jnp.where((weight > 0.0) & jnp.isfinite(weight), weight, 0.0)
 
 
 def _without_cross_term(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix, Matrix]:
@@ -266,43 +299,70 @@ def _cayley(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> _Doubled:
     return _Doubled(E, symmetric(G), symmetric(H), scale)
 
 
-def _double(problem: _Doubled, arithmetic: _Arithmetic) -> _Start:
-    """Anderson's doubling: H grows to the solution and G to that of the dual equation, while E vanishes."""
+def _double(problem: _Doubled, arithmetic: _Arithmetic, terminal: Matrix | None = None) -> _Start:
+    """Doubles the horizon (Anderson) until H is the solution, G that of the dual equation, and E vanishes.
+
+    With a cost `terminal` at the end of the horizon, the same is done to the equation of P - terminal.
+    """
     number, rounded, add, times, divide = arithmetic
     eps = np.finfo(problem.E.dtype).eps
     n = problem.E.shape[0]
     identity = number(identity_like(problem.E))
-    Carry: TypeAlias = tuple[Any, Any, Any, jax.Array, jax.Array]
+    Carry: TypeAlias = tuple[Any, Any, Any, jax.Array, jax.Array, jax.Array]
 
     def even(x: Any) -> Any:
         half = jax.tree.map(lambda part: 0.5 * part, x)
         return add(half, transpose(half))
+
+    def split(both: Any) -> tuple[Any, Any]:
+        left, right = (jax.tree.map(lambda x, part=part: x[:, part], both) for part in (slice(n), slice(n, None)))
+        return left, right
+
+    def beside(x: Any, y: Any) -> Any:
+        return jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=1), x, y)
+
+    def solution(H: Any) -> Matrix:
+        return rounded(H if terminal is None else add(H, number(terminal)))
 
     def unfinished(carry: Carry) -> jax.Array:
         *_, finished, count = carry
         return ~jnp.all(finished) & (count < _MOST_DOUBLINGS)
 
     def double(carry: Carry) -> Carry:
-        E, G, H, _, count = carry
-        both = jax.tree.map(lambda x, y: jnp.concatenate([x, y], axis=1), G, E)
-        both = divide(add(identity, times(G, H)), both)
-        VG, VE = (jax.tree.map(lambda x, part=part: x[:, part], both) for part in (slice(n), slice(n, None)))
+        E, G, H, previous, finished, count = carry
+        VG, VE = split(divide(add(identity, times(G, H)), beside(G, E)))
         more_G = times(times(E, VG), transpose(E))
         more_H = times(times(transpose(E), H), VE)
         G, H = even(add(G, more_G)), even(add(H, more_H))
-        # Convergence is quadratic: what comes after a change of sqrt(eps) is below eps.
-        change = jnp.maximum(_relative_size(rounded(more_G), rounded(G)), _relative_size(rounded(more_H), rounded(H)))
-        return times(E, VE), G, H, ~(change > eps**0.5), count + 1
+        change = jnp.maximum(_relative_size(rounded(more_G), rounded(G)), _relative_size(rounded(more_H), solution(H)))
+        if terminal is None:
+            # Convergence is quadratic: what comes after a change of sqrt(eps) is below eps.
+            finished = ~(change > eps**0.5)
+        else:
+            # Where the weight on a mode near the boundary of stability is the terminal one alone, P is halved first,
+            # until it is as small as the distance from the boundary: only then is convergence quadratic.
+            finished = finished | ((change <= eps) & (change <= 0.25 * previous)) | ~jnp.isfinite(change)
+        return times(E, VE), G, H, change, finished, count + 1
 
-    finished = jnp.zeros(problem.E.shape[2:], dtype=bool)
     E0, G0, H0 = number(problem.E), number(problem.G), number(problem.H)
-    _, G, H, _, _ = lax.while_loop(unfinished, double, (E0, G0, H0, finished, jnp.zeros((), dtype=jnp.int32)))
-    # Where a mode that is not stable is not seen, G grows to where overflow or rounding stops it: it is then no
-    # solution of the dual equation. (Where one cannot be moved, H is none of this, and Newton's method finds none.)
+    if terminal is not None:
+        S, negative = number(terminal), number(-terminal)
+        VG, VE = split(divide(add(identity, times(G0, S)), beside(G0, E0)))
+        E0, G0, H0 = VE, even(VG), add(even(times(times(transpose(E0), S), VE)), add(H0, negative))
+    finished = jnp.zeros(problem.E.shape[2:], dtype=bool)
+    unknown = jnp.full(problem.E.shape[2:], jnp.inf, dtype=problem.E.dtype)
+    carry = (E0, G0, H0, unknown, finished, jnp.zeros((), dtype=jnp.int32))
+    _, G, H, _, finished, _ = lax.while_loop(unfinished, double, carry)
+    # Without a terminal weight, and with a mode that is not stable and that Q does not see, G grows until overflow or
+    # rounding stops it: it is then no solution of the dual equation. (With a mode that cannot be moved, H is none of
+    # this one, and Newton's method finds none.)
     again = rounded(add(G0, times(times(E0, divide(add(identity, times(G, H0)), G)), transpose(E0))))
+    P = solution(H)
     G, H = rounded(G), rounded(H)
     plausible = (largest(again - G) <= 0.4 * largest(G)) & (jnp.sum(G * H, axis=(0, 1)) < 0.01 / eps**2)
-    return _Start(H * problem.scale, plausible)
+    if terminal is not None:
+        plausible = plausible & finished
+    return _Start(P * problem.scale, plausible)
 
 
 def _relative_size(change: Matrix, P: Matrix) -> jax.Array:
@@ -402,12 +462,13 @@ def _discrete_jvp(primals: Problem, tangents: Problem) -> tuple[Any, Any]:
 _Numbers: TypeAlias = np.ndarray[Any, Any]
 
 
-def _check_weights(Q: _Numbers, R: _Numbers, N: _Numbers, *, room: float) -> None:
+def _check_weights(time: str, Q: _Numbers, R: _Numbers, N: _Numbers, *, room: float) -> None:
     for name, weight in (("Q", Q), ("R", R)):
         if np.max(np.abs(weight - weight.T)) > 1e-6 * np.max(np.abs(weight)):
             raise InputError(name, weight, "a symmetric matrix")
     if not np.min(np.linalg.eigvalsh(R)) > 0.0:
-        raise InputError("R", R, "positive definite: every input must cost something")
+        also = "" if time == "continuous" else "; that R + B' P B is positive definite is not enough"
+        raise InputError("R", R, f"positive definite: every input must cost something{also}")
     joint = np.block([[Q, N], [N.T, R]]) if np.any(N) else Q
     size = np.sqrt(np.abs(np.diag(joint)))
     size[size == 0.0] = 1.0
@@ -418,24 +479,47 @@ def _check_weights(Q: _Numbers, R: _Numbers, N: _Numbers, *, room: float) -> Non
 
 
 def _check_modes(time: str, A: _Numbers, B: _Numbers, Q: _Numbers, R: _Numbers, N: _Numbers, *, room: float) -> None:
-    """Refuses a mode that is not stable by itself and that, up to `room`, no input moves or no weight sees."""
+    """Refuses, up to `room`, a mode that is not stable and not moved, and one on the boundary that is not weighed."""
+    mode = _fixed_mode(A, B, _unstable_modes(time, A, room), room)
+    if mode is not None:
+        allowed = (
+            f"stabilisable with A: it must move the mode with eigenvalue {mode:.6g}, which is not stable by itself"
+        )
+        raise InputError("B", B, allowed)
     weight = np.linalg.inv(R)
     free, cost = A - B @ weight @ N.T, Q - N @ weight @ N.T
-    for name, value, matrix, other, words in (
-        ("B", B, A, B, "stabilisable with A: it must move the mode with eigenvalue"),
-        ("Q", Q, free.T, cost, "detectable with A: it must weigh the mode with eigenvalue"),
-    ):
-        mode = _fixed_mode(time, matrix, other, room)
-        if mode is not None:
-            raise InputError(name, value, f"{words} {mode:.6g}, which is not stable by itself")
+    mode = _fixed_mode(free.T, cost, _modes_moved_to_boundary(time, free), room)
+    if mode is not None:
+        boundary = "imaginary axis" if time == "continuous" else "unit circle"
+        allowed = f"detectable with A on the {boundary}: it must weigh the mode with eigenvalue {mode:.6g}"
+        raise InputError("Q", Q, allowed)
 
 
-def _fixed_mode(time: str, A: _Numbers, B: _Numbers, room: float) -> complex | None:
-    """An eigenvalue of A at or beyond the edge of stability that no input moves (Popov, Belevitch and Hautus)."""
+def _unstable_modes(time: str, A: _Numbers, room: float) -> _Numbers:
+    """The eigenvalues outside or on the boundary of stability, up to `room`."""
+    modes: _Numbers = np.linalg.eigvals(A)
+    beyond = modes.real / max(float(np.linalg.norm(A)), 1e-300) if time == "continuous" else np.abs(modes) - 1.0
+    return modes[beyond > -room]
+
+
+def _modes_moved_to_boundary(time: str, A: _Numbers) -> _Numbers:
+    """For every eigenvalue the nearest point of the boundary of stability.
+
+    Rounding parts repeated eigenvalues by far more than it changes the matrix. So the question is not which of them are
+    close to the boundary, but at which of these points the matrix is close to having one.
+    """
+    modes: _Numbers = np.linalg.eigvals(A).astype(np.complex128)
+    if time == "continuous":
+        return 1j * modes.imag
+    return modes[modes != 0.0] / np.abs(modes[modes != 0.0])
+
+
+def _fixed_mode(A: _Numbers, B: _Numbers, modes: _Numbers, room: float) -> complex | None:
+    """Of the given numbers one that is an eigenvalue of A which no input moves (Popov, Belevitch and Hautus)."""
     size, push = max(float(np.linalg.norm(A)), 1e-300), max(float(np.linalg.norm(B)), 1e-300)
-    for mode in np.linalg.eigvals(A):
-        beyond = mode.real / size if time == "continuous" else abs(mode) - 1.0
+    for mode in modes:
         pencil = np.hstack([(mode * np.eye(len(A)) - A) / size, B / push])
-        if beyond > -room and np.linalg.svd(pencil, compute_uv=False)[-1] < room:
-            return complex(mode) if mode.imag else float(mode.real)
+        if np.linalg.svd(pencil, compute_uv=False)[-1] < room:
+            # Adding 0 gives zero the sign that is not printed.
+            return complex(mode.real + 0.0, mode.imag) if abs(mode.imag) > room * size else float(mode.real) + 0.0
     return None

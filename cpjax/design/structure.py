@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from cpjax.design.arguments import matrices, square
+from cpjax.design.arguments import columns, matrices, rows, square
 from cpjax.design.lyapunov import lyapunov
 from cpjax.errors import InputError
 from cpjax.pytree import Number, Scalar, is_traced
@@ -154,17 +154,13 @@ def observability_gramian(A: Any, C: Any, horizon: Scalar | None = None) -> jax.
 def _state_and_inputs(A: Any, B: Any) -> list[jax.Array]:
     A, B = matrices(A=A, B=B)
     n = square("A", A)
-    if B.shape != (n,) and not (B.ndim == 2 and B.shape[0] == n and B.shape[1] > 0):
-        raise InputError("B", f"array of shape {B.shape}", f"of shape ({n}, inputs) or ({n},)")
-    return [A, B.reshape(n, -1)]
+    return [A, columns("B", B, n)]
 
 
 def _state_and_outputs(A: Any, C: Any) -> list[jax.Array]:
     A, C = matrices(A=A, C=C)
     n = square("A", A)
-    if C.shape != (n,) and not (C.ndim == 2 and C.shape[1] == n and C.shape[0] > 0):
-        raise InputError("C", f"array of shape {C.shape}", f"of shape (outputs, {n}) or ({n},)")
-    return [A, C.reshape(-1, n)]
+    return [A, rows("C", C, n)]
 
 
 def _structure(matrix: jax.Array) -> Structure:

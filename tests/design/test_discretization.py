@@ -283,6 +283,14 @@ def test_lists_and_whole_numbers_are_taken():
     assert model.A.dtype == jnp.float64
 
 
+def test_a_vector_is_taken_as_the_input_matrix_and_a_number_as_the_weight_of_one_input():
+    A, B = UPRIGHT
+    plain, right = discretize(A, B[:, 0], 0.1), discretize(A, B, 0.1)
+    cost, right_cost = discretize_cost(A, B[:, 0], np.eye(4), 2, 0.1), discretize_cost(A, B, np.eye(4), [[2.0]], 0.1)
+    for one, other in zip((*plain, *cost), (*right, *right_cost), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 A2, B2 = np.eye(2, k=1), np.ones((2, 1))
 
 
@@ -293,7 +301,8 @@ A2, B2 = np.eye(2, k=1), np.ones((2, 1))
         (lambda: discretize(np.ones((2, 2, 2)), B2, 0.1), "A"),
         (lambda: discretize(A2 * math.nan, B2, 0.1), "A"),
         (lambda: discretize(A2, np.ones((3, 1)), 0.1), "B"),
-        (lambda: discretize(A2, np.ones(2), 0.1), "B"),
+        (lambda: discretize(A2, np.ones(3), 0.1), "B"),
+        (lambda: discretize(A2, 1.0, 0.1), "B"),
         (lambda: discretize(A2, np.ones((2, 0)), 0.1), "B"),
         (lambda: discretize(A2, "b", 0.1), "B"),
         (lambda: discretize(A2, B2, 0.0), "period"),
@@ -306,7 +315,8 @@ A2, B2 = np.eye(2, k=1), np.ones((2, 1))
         (lambda: discretize(A2, B2, 1e12), "period"),
         (lambda: discretize_cost(A2, B2, np.eye(3), np.eye(1), 0.1), "Q"),
         (lambda: discretize_cost(A2, B2, np.eye(2), np.eye(2), 0.1), "R"),
-        (lambda: discretize_cost(A2, B2, np.eye(2), 1.0, 0.1), "R"),
+        (lambda: discretize_cost(A2, np.eye(2), np.eye(2), 1.0, 0.1), "R"),
+        (lambda: discretize_cost(A2, B2, np.eye(2), np.ones(1), 0.1), "R"),
         (lambda: discretize_cost(A2, B2, np.eye(2), np.eye(1), 0.0), "period"),
         (lambda: discretize_cost(np.eye(2), B2, np.eye(2), np.eye(1), 400.0), "period"),
     ],

@@ -353,17 +353,26 @@ def test_every_function_stays_in_float32_and_agrees_with_float64_to_its_digits()
     np.testing.assert_allclose(P, lyapunov_function(A, B, K, np.eye(4)), rtol=1e-4)
 
 
+def test_a_plain_vector_is_taken_as_the_gain_and_the_input_matrix_of_one_input():
+    k, b = np.asarray(K)[0], np.asarray(B)[:, 0]
+    P = lyapunov_function(A, B, K, np.eye(4))
+    np.testing.assert_array_equal(lyapunov_function(A, b, k, np.eye(4)), P)
+    assert float(demanded_voltage(k, 0.1)) == float(demanded_voltage(K, 0.1))
+    assert float(saturation_angle(k, 12.0)) == float(saturation_angle(K, 12.0))
+    assert float(level_within_voltage(P, k, 12.0)) == float(level_within_voltage(P, K, 12.0))
+
+
 INDEFINITE = np.diag([1.0, 1.0, -1.0, 1.0])
 SINGULAR = np.diag([1.0, 1.0, 0.0, 1.0])
 REFUSED = [
-    (demanded_voltage, ([1.0, 2.0, 3.0, 4.0], 0.1), "K", "of shape (1, 4)"),
+    (demanded_voltage, ([1.0, 2.0, 3.0], 0.1), "K", "of shape (1, 4)"),
     (demanded_voltage, ([[1.0, 2.0, math.nan, 4.0]], 0.1), "K", "an array of finite real numbers"),
     (saturation_angle, (K, 0.0), "voltage_limit", "a number above 0 [V]"),
     (saturation_angle, (K, -12.0), "voltage_limit", "a number above 0 [V]"),
     (saturation_angle, (K, math.nan), "voltage_limit", "a number above 0 [V]"),
     (saturation_angle, (K, np.array([12.0, 24.0])), "voltage_limit", "of shape ()"),
     (level_within_voltage, (np.eye(4), K, "12"), "voltage_limit", "a number above 0 [V]"),
-    (level_within_voltage, (np.eye(4), K[0], 12.0), "K", "of shape (1, 4)"),
+    (level_within_voltage, (np.eye(4), K[0, :3], 12.0), "K", "of shape (1, 4)"),
     (level_within_voltage, (np.eye(3), K, 12.0), "K", "of shape (1, 3)"),
     (level_within_voltage, (np.ones((4, 3)), K, 12.0), "P", "a square matrix"),
     (level_within_voltage, (INDEFINITE, K, 12.0), "P", "positive definite"),
@@ -381,8 +390,8 @@ REFUSED = [
     (level_within_form, (np.eye(4), np.eye(3), 1.0), "other", "of shape (4, 4)"),
     (level_within_form, (np.eye(4), np.eye(4), 0.0), "level", "a finite number above 0 [1]"),
     (lyapunov_function, (A, B, -K, np.eye(4)), "A", "stable"),
-    (lyapunov_function, (A, B, K[0], np.eye(4)), "K", "of shape (1, 4)"),
-    (lyapunov_function, (A, B[:, 0], K, np.eye(4)), "B", "of shape (4, 1)"),
+    (lyapunov_function, (A, B, K[0, :3], np.eye(4)), "K", "of shape (1, 4)"),
+    (lyapunov_function, (A, B[:3, 0], K, np.eye(4)), "B", "of shape (4, m)"),
     (lyapunov_function, (A, B, K, np.eye(3)), "Q", "of shape (4, 4)"),
 ]
 

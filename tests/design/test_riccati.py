@@ -154,7 +154,6 @@ def unsolvable(time):
         "a mode on the edge that no input moves": ("B", (np.diag([edge, stable]), high, np.eye(2), ONE)),
         "two equal modes on one input": ("B", (np.diag([growing, growing]), UP, np.eye(2), ONE)),
         "an oscillator that no input moves": ("B", (turning, np.zeros((2, 1)), np.eye(2), ONE)),
-        "an unstable mode that no weight sees": ("Q", (np.diag([growing, stable]), UP, low, ONE)),
         "a mode on the edge that no weight sees": ("Q", (np.diag([edge, stable]), UP, low, ONE)),
         "an oscillator without weights": ("Q", (turning, high, np.zeros((2, 2)), ONE)),
         "a position without weight": ("Q", (edge * np.eye(2) + np.eye(2, k=1), high, low, ONE)),
