@@ -82,8 +82,8 @@ TYPES: dict[str, type] = {
 }
 """What can be saved, by the tag in the file."""
 
-_UNCHECKED: dict[type, dict[str, type]] = {State: {}, Metrics: {}, Trajectory: {"state": State, "metrics": Metrics}}
-"""Classes whose constructors take anything, and those of their fields that are components."""
+_UNCHECKED = (State, Metrics, Trajectory)
+"""Classes whose constructors take anything."""
 
 
 def save(path: str | Path, thing: Any) -> None:
@@ -330,12 +330,16 @@ def _decode(table: dict[str, Any], path: str) -> Any:
 def _check_numbers(cls: type, values: Mapping[str, Any], path: str) -> None:
     """Refuses what JAX could not compute with, in a class whose constructor takes anything."""
     for key, value in values.items():
-        name, parts = f"{path}: {cls.__name__}.{key}", _UNCHECKED[cls]
+        name = f"{path}: {cls.__name__}.{key}"
         number = isinstance(value, (int, float, np.ndarray)) and not (cls is State and isinstance(value, bool))
-        if key in parts and not (isinstance(value, parts[key]) or (key == "metrics" and number)):
-            raise InputError(name, value, f"a table of the type {parts[key].__name__}")
-        if key not in parts and not number:
-            raise InputError(name, value, "a number or an array of numbers")
+        if key == "state":
+            good, allowed = isinstance(value, State), "a table of the type State"
+        elif key == "metrics":
+            good, allowed = number or dataclasses.is_dataclass(value), "what a rollout's fold returned"
+        else:
+            good, allowed = number, "a number or an array of numbers"
+        if not good:
+            raise InputError(name, value, allowed)
 
 
 def _decode_value(value: Any, path: str) -> Any:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from cpjax.cli.options import PLANT_OPTIONS, Option, Sections, add_options, build_plant, parse_poles, resolve
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.errors import InputError
@@ -52,8 +53,8 @@ def run(given: argparse.Namespace) -> int:
 
     save_figure(given.out / "audit_gains.png", picture(audit))
     print_audit(audit, plant)
-    print(*findings(audit), sep="\n")
-    print(f"wrote {path} and {given.out / 'audit_gains.png'}")
+    say(*findings(audit))
+    say(f"wrote {path} and {given.out / 'audit_gains.png'}")
     return 0
 
 

@@ -15,6 +15,7 @@ from cpjax.cli.options import (
     build_plant,
     resolve,
 )
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
@@ -60,8 +61,8 @@ def run(given: argparse.Namespace) -> int:
         print_table(
             "Starts whose gradients are not to be trusted", ("start", "verdict", "why"), doubtful, text_columns=3
         )
-    print(*findings(audit), sep="\n")
-    print(f"wrote {given.out / 'audit_gradients.json'} and {given.out / 'audit_gradients.png'}")
+    say(*findings(audit))
+    say(f"wrote {given.out / 'audit_gradients.json'} and {given.out / 'audit_gradients.png'}")
     return 0
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from cpjax import io
 from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, controller_title, named_hybrid, resolve
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
@@ -84,8 +85,8 @@ def run(given: argparse.Namespace) -> int:
     seconds = time.perf_counter() - begin
     print_table(*table(rows), text_columns=1)
     steps = len(names) * chart.up.cells * chart.across.cells * round(setting["duration"] / setting["dt"])
-    print(f"{steps / 1e6:,.0f} M steps in {seconds:.1f} s, compilation, files and picture included")
-    print(f"wrote {given.out / 'basin.json'}, basin.png and the runs of each map")
+    say(f"{steps / 1e6:,.0f} M steps in {seconds:.1f} s, compilation, files and picture included")
+    say(f"wrote {given.out / 'basin.json'}, basin.png and the runs of each map")
     return 0
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from cpjax import io, paper
 from cpjax.cli.options import EVALUATION_OPTIONS, PLANT_OPTIONS, Option, add_options, build_plant, resolve
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid, LqrWeights, PoleFactors
@@ -52,8 +53,8 @@ def run(given: argparse.Namespace) -> int:
     from cpjax.show.comparison import findings
 
     print_results(results)
-    print(*findings(results), f"responses.png and phase.png show start {shown_start}.", sep="\n")
-    print(f"wrote {given.out / 'compare.json'} and the pictures beside it")
+    say(*findings(results), f"responses.png and phase.png show start {shown_start}.")
+    say(f"wrote {given.out / 'compare.json'} and the pictures beside it")
     return 0
 
 

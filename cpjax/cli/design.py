@@ -5,6 +5,7 @@ from typing import Any
 
 from cpjax import io
 from cpjax.cli.options import CONTROLLER_OPTIONS, PLANT_OPTIONS, add_options, build_hybrid, build_plant, resolve
+from cpjax.cli.output import say
 from cpjax.cli.tables import print_table
 from cpjax.study.design_check import check_design, document
 
@@ -40,5 +41,5 @@ def run(given: argparse.Namespace) -> int:
     title = "u = -K s with K = " + ", ".join(f"{k:.5g}" for k in check.K[0])
     save_figure(given.out / "design.png", picture(check, controller.gate, limit, title))
     print_table(title, ("check", "value", "unit"), rows(check, limit), text_columns=3)
-    print(f"wrote {path} and {given.out / 'design.png'}")
+    say(f"wrote {path} and {given.out / 'design.png'}")
     return 0

@@ -52,21 +52,12 @@ class Stream(io.TextIOBase):
         try:
             getattr(self._stream, method)(*arguments)
         except BrokenPipeError:
-            self._close()
+            self._open = False
         except OSError as problem:
             self.problem = problem
-            self._close()
+            self._open = False
         except ValueError:  # closed by somebody else
             self._open = False
-
-    def _close(self) -> None:
-        """Gives up the stream, and sees that Python, which flushes it once more at its exit, does not fail either."""
-        self._open = False
-        with contextlib.suppress(OSError, ValueError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
-            self._stream.flush()
 
 
 @contextlib.contextmanager
@@ -81,7 +72,34 @@ def streams() -> Iterator[Stream]:
             err.flush()
 
 
+def settle() -> None:
+    """Sees that Python, which flushes both streams once more at its exit, does not fail at what could not be printed.
+
+    For a process that ends: what waits to be printed to a broken stream goes nowhere.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            if stream is not None:
+                stream.flush()
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
+        except ValueError:  # it is closed, and will not be flushed
+            pass
+
+
+def say(*lines: str) -> None:
+    """Lines on standard output, with nothing in them that controls a terminal."""
+    for line in lines:
+        print(shown(line))
+
+
 def complain(text: str) -> None:
-    """One line on standard error: line breaks become spaces, and no character in it controls a terminal."""
-    line = " ".join(text.split())
-    print("".join(c if c.isprintable() else repr(c)[1:-1] for c in line), file=sys.stderr, flush=True)
+    """One line on standard error: line breaks become spaces, and nothing in it controls a terminal."""
+    print(shown(" ".join(text.split())), file=sys.stderr, flush=True)
+
+
+def shown(text: str) -> str:
+    """The text with escapes for what is no printable character, such as those in the names of files."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

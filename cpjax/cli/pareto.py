@@ -9,6 +9,7 @@ import numpy as np
 
 from cpjax import io, paper
 from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, resolve
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.errors import InputError
@@ -76,8 +77,8 @@ def run(given: argparse.Namespace) -> int:
     print_table(*table(found), text_columns=2)
     from cpjax.show.front import findings
 
-    print(*findings(curves_of(found)), *costs(found), sep="\n")
-    print(f"wrote {given.out / 'pareto.json'}, pareto.png and supplies.png")
+    say(*findings(curves_of(found)), *costs(found))
+    say(f"wrote {given.out / 'pareto.json'}, pareto.png and supplies.png")
     return 0
 
 

@@ -17,6 +17,7 @@ from cpjax.cli.options import (
     build_plant,
     resolve,
 )
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.sim.metrics import ProtocolMetrics
@@ -82,7 +83,7 @@ def run(given: argparse.Namespace) -> int:
     steps = round(setting["duration"] / setting["dt"])
     speed = f"{count * steps / 1e6:.0f} M steps in {seconds:.1f} s, compilation and files included"
     if metrics is None:
-        print(f"{speed}\nwrote {path}")
+        say(speed, f"wrote {path}")
         return 0
 
     from cpjax.show.figures import save_figure
@@ -108,7 +109,7 @@ def run(given: argparse.Namespace) -> int:
     rows = [(cost, *(f"{spread[cost][key]:.4g}" for key in ("mean", "median", "max"))) for cost in COSTS]
     print_table("Over the successful runs", ("metric", "mean", "median", "max"), rows, text_columns=1)
     low, high = (100 * bound for bound in summary["success_interval"])
-    print(f"{100 * summary['success_rate']:.2f} % of {count} starts settle ({low:.2f} to {high:.2f} %)")
-    print(speed)
-    print(f"wrote {path}, sweep.json and sweep.png")
+    say(f"{100 * summary['success_rate']:.2f} % of {count} starts settle ({low:.2f} to {high:.2f} %)")
+    say(speed)
+    say(f"wrote {path}, sweep.json and sweep.png")
     return 0

@@ -19,6 +19,7 @@ from cpjax.cli.options import (
     build_start,
     resolve,
 )
+from cpjax.cli.output import say
 from cpjax.errors import InputError
 from cpjax.sim.flags import describe
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
@@ -85,7 +86,7 @@ def run(given: argparse.Namespace) -> int:
     until = min(end, float(metrics.settling_time) + 3.0) if bool(metrics.success) else end  # at rest there is no news
     save_figure(picture, response(trajectory, _title(metrics), until, float(plant.motor.voltage_limit)))
     _print(metrics)
-    print(f"wrote {path} and {picture}")
+    say(f"wrote {path} and {picture}")
     return 0 if bool(metrics.success) else 1
 
 

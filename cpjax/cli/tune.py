@@ -9,6 +9,7 @@ import numpy as np
 
 from cpjax import io
 from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, numbers_of, resolve
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
@@ -97,11 +98,11 @@ def run(given: argparse.Namespace) -> int:
     rows = [(label, f"{a:.4g}", f"{b:.4g}") for label, a, b in zip(tuning.labels, before, tuning.physical, strict=True)]
     print_table("Parameters, SI units", ("parameter", "start", "tuned"), rows, text_columns=1)
     after = f", after {tuning.settling_time:.3f} s on average" if tuning.success_rate > 0.0 else ""
-    print(
+    say(
         f"{100 * tuning.success_rate:.2f} % of {plan.final} starts settle{after}; {tuning.value_steps / 1e6:.1f} M "
         f"steps of values, {tuning.gradient_steps / 1e6:.2f} M of gradients, {tuning.seconds:.0f} s"
     )
-    print(f"wrote {given.out / 'tuned.json'}, tune.json and tune.png")
+    say(f"wrote {given.out / 'tuned.json'}, tune.json and tune.png")
     return 0 if tuning.success_rate > 0.0 else 1
 
 
