@@ -19,6 +19,14 @@ class InputError(ValueError):
         super().__init__(f"{field} = {_short(value)}: must be {allowed}")
 
 
+class MissingError(InputError):
+    """A value that has to be given and was not."""
+
+    def __init__(self, field: str, why: str) -> None:
+        super().__init__(field, None, f"given, because {why}")
+        self.args = (f"{field}: must be given, because {why}",)
+
+
 def _short(value: Any) -> str:
     text = " ".join(repr(value).split())
     return text if len(text) <= 120 else text[:117] + "..."

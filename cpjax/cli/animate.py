@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from cpjax import io
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import (
     PLANT_OPTIONS,
     START_OPTIONS,
@@ -67,8 +68,10 @@ def run(given: argparse.Namespace) -> int:
     if len(set(names)) < len(names):
         raise InputError("controllers", names, "each one once")
     controllers = {name: named_hybrid(name, plant) for name in names}
+    notes = notes_on(sections["plant"], plant, controllers)
+    announce("animate", notes)
     start = build_start(sections["start"], given.seed)
-    path, runs = animated(given.out, plant, controllers, start, chosen, seed=given.seed)
+    path, runs = animated(given.out, plant, controllers, start, chosen, seed=given.seed, notes=notes)
     for name, one in runs.items():
         say(f"{controller_title(name)}: {verdict(one, chosen['duration'])}")
     say(f"wrote {path} and animation.json")

@@ -1,11 +1,12 @@
 """`cpjax audit-gradients`: can gradients through this loop be trusted? A table, a picture and JSON."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cpjax import io
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import (
     CONTROLLER_OPTIONS,
     PLANT_OPTIONS,
@@ -51,7 +52,9 @@ def run(given: argparse.Namespace) -> int:
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     controller = build_hybrid(sections["controller"], plant)
-    audit = audited(given.out, plant, controller, sections["audit"], given.seed)
+    notes = notes_on(sections["plant"], plant, {"the controller": controller})
+    announce("audit-gradients", notes)
+    audit = audited(given.out, plant, controller, sections["audit"], given.seed, notes)
 
     from cpjax.show.gradients import TITLE, cells, findings, header
 
@@ -66,7 +69,9 @@ def run(given: argparse.Namespace) -> int:
     return 0
 
 
-def audited(out: Path, plant: CartPole, controller: Hybrid, setting: Mapping[str, Any], seed: int) -> GradientAudit:
+def audited(
+    out: Path, plant: CartPole, controller: Hybrid, setting: Mapping[str, Any], seed: int, notes: Sequence[str] = ()
+) -> GradientAudit:
     """The audit, with its JSON and picture written; `setting` is by the options' keys, what is missing by default."""
     setting = {"starts": "hanging", "count": 16, "duration": 4.0, "dt": 1e-3, **setting}
     starts = sample_starts(setting["starts"], setting["count"], seed=seed)
@@ -81,7 +86,7 @@ def audited(out: Path, plant: CartPole, controller: Hybrid, setting: Mapping[str
             dt=setting["dt"],
             progress=report,
         )
-    loop = {"plant": io.encode(plant), "controller": io.encode(controller)}
+    loop = {"plant": io.encode(plant), "controller": io.encode(controller), "notes": notes}
     described = document(audit, starts, seed=seed, setting=setting, parameters=chosen.parameters, **loop)
     io.write_json(out / "audit_gradients.json", described)
 

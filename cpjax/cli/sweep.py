@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from cpjax import io
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import (
     CONTROLLER_OPTIONS,
     EVALUATION_OPTIONS,
@@ -53,6 +54,8 @@ def run(given: argparse.Namespace) -> int:
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     controller = build_controller(sections["controller"], plant)
+    notes = notes_on(sections["plant"], plant, {"the controller": controller})
+    announce("sweep", notes)
     setting = {"starts": "hanging", "count": 4096, "duration": 20.0, "dt": 0.002, **sections["evaluation"]}
     chosen = {"precision": "float64", "format": "npz", **sections["sweep"]}
     name, count = setting.pop("starts"), setting.pop("count")
@@ -99,6 +102,7 @@ def run(given: argparse.Namespace) -> int:
         "precision": chosen["precision"],
         "plant": io.encode(plant),
         "controller": io.encode(controller),
+        "notes": notes,
         "file": path.name,
         "seconds": seconds,
         **summary,

@@ -9,7 +9,7 @@ from cpjax.cli.output import shown
 
 
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int) -> None:
-    """A table whose first `text_columns` columns are words and whose others are numbers."""
+    """Prints a table whose first `text_columns` columns are words and whose others are numbers."""
     table = Table(title=shown(title), title_justify="left")
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i < text_columns else "right", overflow="fold")

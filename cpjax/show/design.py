@@ -46,19 +46,37 @@ def compared(design: str, gains: str, check: DesignCheck) -> list[str]:
     ]
 
 
+_MARGINS = {
+    "gain may fall to": "times",
+    "gain may rise to": "times",
+    "phase margin": "deg",
+    "delay margin": "ms",
+    "disk margin": "of 2",
+}
+
+
+def instability(check: DesignCheck) -> str | None:
+    """Says which pole makes the linear loop unstable, if one does."""
+    if bool(check.margins.stable):
+        return None
+    worst = complex(check.poles[np.argmax(check.poles.real)])
+    return f"not stable: a closed-loop pole at {_complex(worst)} 1/s; there are no margins and no certified region"
+
+
 def rows(check: DesignCheck, voltage_limit: float) -> list[tuple[str, str, str]]:
     """What was checked, the figure and its unit."""
     m = check.margins
+    if not bool(m.stable):  # the margins of such a loop are NaN
+        margins = [(name, "none", "the linear loop is not stable") for name in _MARGINS]
+    else:
+        values = (m.gain_lower, m.gain_upper, math.degrees(float(m.phase)), 1000 * float(m.delay), m.disk)
+        margins = [(name, f"{float(v):.3g}", unit) for (name, unit), v in zip(_MARGINS.items(), values, strict=True)]
     numbers = [
         ("gain K", " ".join(f"{k:.6g}" for k in check.K[0]), "V per unit"),
         ("closed-loop poles", "  ".join(_complex(p) for p in check.poles), "1/s"),
         ("controllability", _structure(check.controllability), ""),
         ("observability from x and theta", _structure(check.observability), ""),
-        ("gain may fall to", f"{float(m.gain_lower):.3g}", "times"),
-        ("gain may rise to", f"{float(m.gain_upper):.3g}", "times"),
-        ("phase margin", f"{math.degrees(float(m.phase)):.3g}", "deg"),
-        ("delay margin", f"{1000 * float(m.delay):.3g}", "ms"),
-        ("disk margin", f"{float(m.disk):.3g}", "of 2"),
+        *margins,
         (f"voltage at the gate, {math.degrees(check.gate_angle):.3g} deg", f"{check.gate_voltage:.4g}", "V"),
         (f"asks for more than {voltage_limit:g} V beyond", f"{math.degrees(check.saturation_angle):.3g}", "deg"),
     ]
