@@ -114,6 +114,7 @@ def _run(arguments: list[str], set_up: bool) -> int:
         return int(stop.code or 0)
 
     import jax
+    import numpy as np
 
     if set_up:
         from cpjax import runtime
@@ -126,7 +127,8 @@ def _run(arguments: list[str], set_up: bool) -> int:
     # The protocol's figures are float64. Set here, in the application: the library never touches JAX's settings.
     jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # JAX has no annotations for it
     try:
-        code: int = options.run(options)
+        with np.errstate(all="ignore"):  # an overflow shows in the result, or in the one line of an error
+            code: int = options.run(options)
         return code
     except InputError as problem:
         complain(f"cpjax {options.command}: error: {problem}")

@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import PLANT_OPTIONS, Option, Sections, add_options, build_plant, parse_poles, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
@@ -41,6 +42,7 @@ def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
+    announce("audit-gains", notes_on(sections["plant"], plant))
     prints = _prints(sections["gains"])
     setting = _setting(sections)
     with progress("audit-gains") as report:

@@ -17,7 +17,7 @@ from cpjax.cli.options import (
     resolve,
 )
 from cpjax.cli.output import say
-from cpjax.cli.progress import progress
+from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
@@ -84,7 +84,7 @@ def audited(
             scales=chosen.scales,
             duration=setting["duration"],
             dt=setting["dt"],
-            progress=report,
+            progress=compiling(report, "located"),
         )
     loop = {"plant": io.encode(plant), "controller": io.encode(controller), "notes": notes}
     described = document(audit, starts, seed=seed, setting=setting, parameters=chosen.parameters, **loop)

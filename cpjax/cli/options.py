@@ -375,8 +375,8 @@ def _designed(what: str, plant: CartPole, design: Callable[[Any, Any], Any]) -> 
     """What `design` makes of the linear model; if that is impossible, it is the plant's fault as well."""
     try:
         return design(*linearize(plant))
-    except InputError as problem:
-        if problem.field not in ("A", "B"):
+    except (InputError, np.linalg.LinAlgError) as problem:
+        if isinstance(problem, InputError) and problem.field not in ("A", "B"):
             raise
         raise InputError("plant", plant, f"one for which this {what} can be computed ({problem})") from problem
 

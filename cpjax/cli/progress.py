@@ -27,3 +27,19 @@ def progress(what: str) -> Iterator[Report]:
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("", what=shown(what))
         yield lambda done, total, text: bar.update(task, completed=done, total=total, description=shown(text))
+
+
+def compiling(report: Report, before: str) -> Report:
+    """The same, and the first text that begins with `before` says that a compilation comes first, which says nothing.
+
+    Of a gradient it takes a minute or more, unless an earlier process has kept what it compiled.
+    """
+    told = False
+
+    def tell(done: int, total: int, text: str) -> None:
+        nonlocal told
+        first = not told and text.startswith(before)
+        told = told or first
+        report(done, total, text + "; compiling the gradient (about a minute the first time)" * first)
+
+    return tell

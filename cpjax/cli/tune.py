@@ -12,7 +12,7 @@ from cpjax import io
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, numbers_of, resolve, saved
 from cpjax.cli.output import say
-from cpjax.cli.progress import progress
+from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
@@ -118,7 +118,7 @@ def tuned(
     from cpjax.tune.tuner import tune  # optax takes a while; other commands should not wait for it
 
     with progress("tune") as report:
-        tuning = tune(plant, free, plan, progress=report, checkpoint=checkpoint)
+        tuning = tune(plant, free, plan, progress=compiling(report, "loss"), checkpoint=checkpoint)
     io.save(out / "tuned.json", tuning.controller)
     io.write_json(out / "tune.json", {**document(tuning, plant, free, plan), "notes": notes})
 
