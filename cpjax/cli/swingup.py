@@ -121,9 +121,9 @@ def _print(metrics: Metrics) -> None:
 def reason(run: Trajectory, fold: ProtocolMetrics, *, hybrid: bool) -> str:
     """Why a run does not count as settled, as far as it is plain to see."""
     flag, end = int(run.flag), float(run.time[-1])
-    x, theta = float(run.state.x[-1]), float(run.state.theta[-1])
+    states = np.asarray(run.state.vector())
+    x, theta = float(states[-1, 0]), float(states[-1, 2])
     if flag & STOPPED:
-        states = np.asarray(run.state.vector())
         held = np.all(states == states[-1], axis=1)
         since = float(run.time[_first_of_the_last(held)])
         what = "left all bounds" if flag & int(Flag.RUNAWAY) else "could not be computed any further"

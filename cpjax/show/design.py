@@ -77,7 +77,13 @@ def rows(check: DesignCheck, voltage_limit: float) -> list[tuple[str, str, str]]
     if not bool(m.stable):  # the margins of such a loop are NaN
         margins = [(name, "none", "the linear loop is not stable") for name in _MARGINS]
     else:
-        values = (m.gain_lower, m.gain_upper, math.degrees(float(m.phase)), 1000 * float(m.delay), m.disk)
+        values: tuple[Any, ...] = (
+            m.gain_lower,
+            m.gain_upper,
+            math.degrees(float(m.phase)),
+            1000 * float(m.delay),
+            m.disk,
+        )
         margins = [(name, f"{float(v):.3g}", unit) for (name, unit), v in zip(_MARGINS.items(), values, strict=True)]
     numbers = [
         ("gain K", " ".join(f"{k:.6g}" for k in check.K[0]), "V per unit"),
