@@ -347,7 +347,7 @@ def test_a_state_weight_of_another_shape_is_refused_by_name(command, tmp_path, v
 def test_a_flag_of_another_number_of_weights_is_refused_by_name(command, tmp_path, flags):
     result = command("design", "--q", *flags, "--out", tmp_path / "out")
     assert (result.code, result.err.count("\n")) == (2, 1)
-    assert "--q = " in result.err
+    assert "argument --q: expected 4 arguments, or 16" in result.err
 
 
 def test_poles_may_be_numbers_texts_or_pairs_in_a_file(command, tmp_path):

@@ -159,9 +159,22 @@ def add_options(parser: argparse.ArgumentParser, options: Sequence[Option], *, o
                 type=option.type,
                 choices=option.choices,
                 nargs="+" if isinstance(option.count, tuple) else option.count,
+                action=_one_of(option.count) if isinstance(option.count, tuple) else "store",
                 metavar=None if option.choices else option.key.upper(),
                 help=option.help + (f" (key: {option.key})" if option.flag else ""),
             )
+
+
+def _one_of(counts: tuple[int, int]) -> type[argparse.Action]:
+    """Stores so many values, or so many."""
+
+    class Store(argparse.Action):
+        def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+            if len(values) not in counts:
+                raise argparse.ArgumentError(self, f"expected {counts[0]} arguments, or {counts[1]}")
+            setattr(namespace, self.dest, values)
+
+    return Store
 
 
 def resolve(given: argparse.Namespace, options: Sequence[Option]) -> Sections:
@@ -176,8 +189,6 @@ def resolve(given: argparse.Namespace, options: Sequence[Option]) -> Sections:
     for option in options:
         value = getattr(given, f"{option.section}.{option.key}")
         if value is not None:
-            if isinstance(option.count, tuple) and len(value) not in option.count:
-                raise InputError(option.name, value, _counted(option.count))
             sections[option.section][option.key] = value
     return sections
 
@@ -384,7 +395,7 @@ def _designed(what: str, plant: CartPole, design: Callable[[Any, Any], Any]) -> 
 def _weights(given: Mapping[str, Any]) -> tuple[np.ndarray[Any, Any], list[list[float]]]:
     numbers = np.asarray(given.get("Q", paper.Q), dtype=float)
     Q = np.diag(numbers) if numbers.size == 4 else numbers.reshape(4, 4)
-    if not np.array_equal(Q, Q.T):
+    if not np.array_equal(Q, Q.T, equal_nan=True):
         raise InputError("Q", given["Q"], "a symmetric matrix")
     return Q, [[float(given.get("R", paper.R))]]
 
