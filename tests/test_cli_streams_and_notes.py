@@ -211,6 +211,12 @@ def test_the_papers_plants_keep_its_printed_gain_whatever_their_supply(command, 
     np.testing.assert_array_equal(gain(tmp_path), [paper.PRINTED_GAINS["placement"]])
 
 
+def test_a_plant_for_which_no_gain_can_be_computed_is_refused_with_the_ways_out(command, tmp_path):
+    result = command("design", "--pole-length", "1e-300", "--out", tmp_path / "out")
+    assert (result.code, result.err.count("\n")) == (2, 1)
+    assert "give a gain of your own, or take the paper's with --gains printed" in result.err
+
+
 def test_printed_gains_asked_for_on_another_plant_are_printed_and_said_to_be(command, tmp_path):
     result = command("design", "--cart-mass", "1.2", "--gains", "printed", "--out", tmp_path)
     assert result.code == 0

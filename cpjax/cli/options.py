@@ -373,7 +373,13 @@ def _build_regulator(changes: dict[str, Any], plant: CartPole, reference: State)
         K = _designed("gain", plant, lambda A, B: lqr(A, B, Q, R).K)
         return StateFeedback(K, reference, LqrWeights(Q, R[0][0]))
     gains = given.get("gains") or default_gains(plant)
-    regulator = paper.regulator(given.get("design", "placement"), gains, plant)
+    try:
+        regulator = paper.regulator(given.get("design", "placement"), gains, plant)
+    except InputError as problem:
+        if "gains" in given:
+            raise
+        hint = "; or give a gain of your own, or take the paper's with --gains printed"
+        raise InputError(problem.field, problem.value, problem.allowed + hint) from problem
     return dataclasses.replace(regulator, reference=reference)
 
 

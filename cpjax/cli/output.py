@@ -7,6 +7,8 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
+from cpjax.errors import one_line, printable
+
 
 class Stream(io.TextIOBase):
     """Prints to another stream as long as that works; from the first failure on, to nowhere.
@@ -92,14 +94,9 @@ def settle() -> None:
 def say(*lines: str) -> None:
     """Lines on standard output, with nothing in them that controls a terminal."""
     for line in lines:
-        print(shown(line))
+        print(printable(line))
 
 
 def complain(text: str) -> None:
-    """One line on standard error: line breaks become spaces, and nothing in it controls a terminal."""
-    print(shown(" ".join(text.split())), file=sys.stderr, flush=True)
-
-
-def shown(text: str) -> str:
-    """The text with escapes for what is no printable character, such as those in the names of files."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    """One line on standard error."""
+    print(one_line(text), file=sys.stderr, flush=True)

@@ -8,7 +8,8 @@ from typing import TypeAlias
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from cpjax.cli.output import complain, shown
+from cpjax.cli.output import complain
+from cpjax.errors import printable
 
 Report: TypeAlias = Callable[[int, int, str], None]
 """Takes how much is done, of how much, and what comes next."""
@@ -25,8 +26,8 @@ def progress(what: str) -> Iterator[Report]:
     )
     columns = (what_it_is, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), what_comes)
     with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("", what=shown(what))
-        yield lambda done, total, text: bar.update(task, completed=done, total=total, description=shown(text))
+        task = bar.add_task("", what=printable(what))
+        yield lambda done, total, text: bar.update(task, completed=done, total=total, description=printable(text))
 
 
 def compiling(report: Report, before: str) -> Report:
