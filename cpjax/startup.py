@@ -7,6 +7,7 @@ its first import is this module.
 import os
 import signal
 import sys
+import threading
 from typing import Any
 
 
@@ -35,6 +36,16 @@ def ready() -> None:
     """Hands interrupts back to Python, which raises KeyboardInterrupt for them: the imports are done."""
     if signal.getsignal(signal.SIGINT) is _end:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.unraisablehook = _again
+
+
+def _again(unraisable: Any) -> None:
+    """Interrupts once more where Python has dropped the interrupt, in a callback of the garbage collector for one."""
+    if unraisable.exc_type is KeyboardInterrupt:
+        # Later, from elsewhere: at once it would be dropped again.
+        threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(unraisable)
 
 
 def _end(*_: Any) -> None:

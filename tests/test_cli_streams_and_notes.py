@@ -137,6 +137,27 @@ import cpjax
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
+def test_an_interrupt_that_python_drops_in_a_callback_comes_again():
+    script = """
+import gc, os, signal, sys, time
+sys.argv = ["/usr/bin/cpjax"]
+from cpjax import startup
+startup.ready()
+def interrupted(*_):
+    gc.callbacks.clear()
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.001)
+gc.callbacks.append(interrupted)
+try:
+    gc.collect()
+    time.sleep(20)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
+
+
 @pytest.mark.parametrize(
     ("name", "whole", "expected"),
     [
@@ -164,7 +185,9 @@ def test_a_prepared_process_hides_xlas_alarm_unless_somebody_wants_it_and_gives_
                 monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", given)
             at_start.prepare()
             assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == expected
+        hook = sys.unraisablehook
         at_start.ready()
+        monkeypatch.setattr(sys, "unraisablehook", hook)
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)

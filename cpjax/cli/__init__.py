@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import os
 import re
 import signal
 import sys
@@ -25,6 +26,7 @@ Files are written whatever becomes of standard output. A reader of it that goes 
 standard output that is closed, changes no exit code.
 """
 
+INTERRUPTED = 130
 
 _COMMANDS = (
     "swingup",
@@ -76,6 +78,8 @@ def command() -> int:
     """What the shell calls: `main`, in a process of its own, whose JAX may be set up for the command."""
     code = main(set_up=True)
     output.settle()
+    if code == INTERRUPTED:
+        os._exit(code)  # JAX, interrupted in the middle of a compilation, may crash while Python cleans up
     return code
 
 
@@ -89,13 +93,12 @@ def main(arguments: Sequence[str] | None = None, *, set_up: bool = False) -> int
     given = sys.argv[1:] if arguments is None else list(arguments)
     with output.streams() as out:
         try:
-            startup.ready()
             code = _run(given, set_up)
         except KeyboardInterrupt:
             if set_up:  # what is left to do takes no time, and a second interrupt would end it with a traceback
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
             complain(f"cpjax {given[0] if given else ''}: interrupted; what was saved so far is kept")
-            code = 130
+            code = INTERRUPTED
         out.flush()
         if out.problem is not None:
             complain(f"cpjax {given[0] if given else ''}: error: standard output cannot be written: {out.problem}")
@@ -122,6 +125,7 @@ def _run(arguments: list[str], set_up: bool) -> int:
         runtime.keep_compilations()
         if getattr(options, "many_starts", False):
             runtime.configure_cpu()
+        startup.ready()  # until here an interrupt ends the process at once: nothing has been written
         if not sys.warnoptions:  # what matters of them is in the results, as a flag, or in an error
             warnings.simplefilter("ignore")
     # The protocol's figures are float64. Set here, in the application: the library never touches JAX's settings.

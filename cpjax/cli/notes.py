@@ -69,8 +69,7 @@ def controller_notes(name: str, controller: Any, plant: CartPole) -> list[str]:
         printed = [design for design, K in paper.PRINTED_GAINS.items() if np.allclose(regulator.K, [K], rtol=1e-6)]
         if printed and papers_own(plant) is None:
             found.append(
-                f"{name} has the gain that the paper prints for its own plant ({printed[0]}), which this is not; "
-                "--gains computed makes one for this plant"
+                f"{name} has the gain that the paper prints for its own plant ({printed[0]}), which this is not"
             )
         pole = unstable_pole(plant, regulator)
         if pole is not None:
