@@ -4,6 +4,9 @@ A plant, a controller and a start go in; a trajectory, its metrics and their der
 million. Importing this package starts no JAX backend, draws nothing and changes none of JAX's settings.
 """
 
+from cpjax import startup as _startup  # noqa: F401  # first of all: the other imports take a second
+
+# isort: split
 from importlib.metadata import PackageNotFoundError, version
 
 from cpjax import paper

@@ -16,7 +16,25 @@ class InputError(ValueError):
         self.field = field
         self.value = value
         self.allowed = allowed
-        super().__init__(f"{field} = {_short(value)}: must be {allowed}")
+        super().__init__(one_line(f"{field} = {_short(value)}: must be {allowed}"))
+
+
+class MissingError(InputError):
+    """A value that has to be given and was not."""
+
+    def __init__(self, field: str, why: str) -> None:
+        super().__init__(field, None, f"given, because {why}")
+        self.args = (one_line(f"{field}: must be given, because {why}"),)
+
+
+def one_line(text: str) -> str:
+    """The text without line breaks, and with nothing in it that controls a terminal."""
+    return printable(" ".join(text.splitlines()))
+
+
+def printable(text: str) -> str:
+    """The text with escapes for what is no printable character, such as those in the names of files."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _short(value: Any) -> str:

@@ -18,7 +18,7 @@ import stat
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -50,6 +50,12 @@ _NON_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 SCHEMA = 1
 """Version of the files' layout."""
 
+DTYPES = ("bool", "int32", "int64", "float32", "float64")
+"""What the numbers of a file's arrays may be."""
+
+_KINDS = {"b": "b", "i": "iu", "f": "fiu"}
+"""By the kind of a dtype, the kinds of the values that stand for it."""
+
 TYPES: dict[str, type] = {
     cls.__name__: cls
     for cls in (
@@ -76,6 +82,9 @@ TYPES: dict[str, type] = {
 }
 """What can be saved, by the tag in the file."""
 
+_UNCHECKED = (State, Metrics, Trajectory)
+"""Classes whose constructors take anything."""
+
 
 def save(path: str | Path, thing: Any) -> None:
     """Writes a plant, controller, state or result; JSON or TOML by the path's extension.
@@ -101,7 +110,38 @@ def load(path: str | Path) -> Any:
     schema = table.pop("schema", SCHEMA)
     if isinstance(schema, bool) or schema != SCHEMA:
         raise InputError(f"{path}: schema", schema, f"{SCHEMA}, the layout that this version of cpjax reads")
+    if "type" not in table and "what" in table:
+        raise InputError("path", str(path), f"a file with one component; this one holds {contents(table)}")
     return _decode(table, str(path))
+
+
+def load_part(path: str | Path, key: Literal["plant", "controller"], wanted: str) -> Any:
+    """What `load` returns; of a result that a command wrote, its plant or its controller.
+
+    Args:
+      key: the part of a result, and what the error names.
+      wanted: in words, for the error.
+
+    Raises:
+      InputError: as `load` does, or the file holds something else.
+    """
+    path = _checked_path(path)
+    table = read_table(path)
+    if "type" not in table and isinstance(table.get(key), dict):
+        return _decode(table[key], f"{path}: {key}")
+    if table.get("type") not in [*TYPES]:
+        raise InputError(key, str(path), f"a file that holds {wanted}; this one holds {contents(table)}")
+    return load(path)
+
+
+def contents(table: Mapping[str, Any]) -> str:
+    """What a file's table holds, in words."""
+    if "type" in table:
+        return f"a {table['type']}" if isinstance(table["type"], str) else "a table whose type is no text"
+    if isinstance(table.get("what"), str):
+        return f"a result ({table['what']})"
+    keys = [*table][:4] + ["..."] * (len(table) > 4)
+    return "a table without a type" + (f" (its keys: {', '.join(keys)})" if keys else ", which is empty")
 
 
 def encode(thing: Any) -> dict[str, Any]:
@@ -226,8 +266,15 @@ def release(folder: Path) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
-    return {name: importlib.metadata.version(name) for name in ("cpjax", "jax", "jaxlib", "numpy", "scipy")}
+    """Versions of what a result depends on; "0+unknown" for a package that runs without having been installed."""
+    return {name: _version(name) for name in ("cpjax", "jax", "jaxlib", "numpy", "scipy")}
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "0+unknown"
 
 
 def _checked_path(path: Any) -> Path:
@@ -252,6 +299,8 @@ def _encode_value(name: str, value: Any) -> Any:
     array = np.asarray(value)
     if array.dtype.kind not in "biuf":
         raise InputError(name, value, "a number, an array of numbers, or one of " + ", ".join(TYPES))
+    if array.dtype.name not in DTYPES:
+        raise InputError(name, f"array of dtype {array.dtype}", "of dtype " + ", ".join(DTYPES))
     if array.dtype == np.float64:
         return array.tolist()
     return {"dtype": str(array.dtype), "values": array.tolist()}
@@ -273,26 +322,38 @@ def _decode(table: dict[str, Any], path: str) -> Any:
     for name, field in fields.items():
         if name not in table and (field.default, field.default_factory) == optional:
             raise InputError(f"{path}: key", name, f"present: {tag} has no default for it")
-    values = {key: _decode_value(value, f"{path}: {key}") for key, value in table.items() if key != "outputs"}
+    outputs = table.pop("outputs", {})
+    values = {key: _decode_value(value, f"{path}: {key}") for key, value in (table | outputs).items()}
+    if cls in _UNCHECKED:
+        _check_numbers(cls, values, path)
     if cls is Trajectory:
-        values["outputs"] = {key: _decode_value(value, f"{path}: {key}") for key, value in table["outputs"].items()}
+        values["outputs"] = {key: values.pop(key) for key in outputs}
     try:
         return cls(**values)
     except InputError as problem:
         raise InputError(f"{path}: {problem.field}", problem.value, problem.allowed) from problem
 
 
+def _check_numbers(cls: type, values: Mapping[str, Any], path: str) -> None:
+    """Refuses what JAX could not compute with, in a class whose constructor takes anything."""
+    for key, value in values.items():
+        name = f"{path}: {cls.__name__}.{key}"
+        number = isinstance(value, (int, float, np.ndarray)) and not (cls is State and isinstance(value, bool))
+        if key == "state":
+            good, allowed = isinstance(value, State), "a table of the type State"
+        elif key == "metrics":
+            good, allowed = number or dataclasses.is_dataclass(value), "what a rollout's fold returned"
+        else:
+            good, allowed = number, "a number or an array of numbers"
+        if not good:
+            raise InputError(name, value, allowed)
+
+
 def _decode_value(value: Any, path: str) -> Any:
     if isinstance(value, dict):
         if set(value) != {"dtype", "values"}:
             return _decode(value, path)
-        try:
-            array = np.asarray(value["values"], dtype=value["dtype"])
-            if array.dtype.kind not in "biuf":
-                raise ValueError(f"dtype {array.dtype}")
-            return array
-        except (TypeError, ValueError, OverflowError) as problem:
-            raise InputError(path, value, "a table of dtype and values that fit each other") from problem
+        return _array(value["values"], value["dtype"], path, value)
     if isinstance(value, list):
         try:
             array = np.asarray(value)
@@ -302,6 +363,25 @@ def _decode_value(value: Any, path: str) -> Any:
         except (TypeError, ValueError, OverflowError) as problem:
             raise InputError(path, value, f"a list of numbers, nested evenly ({problem})") from problem
     return value
+
+
+def _array(values: Any, dtype: Any, path: str, shown: Any) -> np.ndarray[Any, Any]:
+    """The array of a table of `dtype` and `values`, each of which has to be a number of that kind already."""
+    try:
+        given = np.asarray(values)
+        named = np.dtype(dtype) if isinstance(dtype, str) else None
+        if named is None or named.name != dtype or dtype not in DTYPES:
+            raise ValueError("another dtype")
+        if given.size and given.dtype.kind not in _KINDS[named.kind]:
+            raise ValueError("values of another kind")
+        with np.errstate(over="raise"):
+            array = given.astype(named)
+        if named.kind == "i" and not np.array_equal(array, given):
+            raise ValueError("whole numbers that do not fit")
+        return array
+    except (TypeError, ValueError, OverflowError, FloatingPointError) as problem:
+        allowed = f"a table of dtype and values that fit each other; dtype one of {', '.join(DTYPES)}"
+        raise InputError(path, shown, allowed) from problem
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import cpjax
 
 ROOT = Path(cpjax.__file__).parent
 ROOMS = [
+    "startup",
     "errors",
     "pytree",
     "runtime",

@@ -121,10 +121,10 @@ def test_a_place_that_cannot_be_written_is_one_line_on_standard_error(command, t
 
 
 BAD_FLAGS = [
-    (LQR, ["Q = None", "given: an lqr gain is designed for weights"]),
-    ((*LQR, *WEIGHTS[5:]), ["Q = None", "given: an lqr gain is designed for weights"]),
-    ((*LQR, *WEIGHTS[:5]), ["R = None", "given: an lqr gain is designed for weights"]),
-    (PLACEMENT, ["poles = None", "given: a placement gain is designed for poles"]),
+    (LQR, ["Q: must be given, because an lqr gain is designed for weights"]),
+    ((*LQR, *WEIGHTS[5:]), ["Q: must be given, because an lqr gain is designed for weights"]),
+    ((*LQR, *WEIGHTS[:5]), ["R: must be given, because an lqr gain is designed for weights"]),
+    (PLACEMENT, ["poles: must be given, because a placement gain is designed for poles"]),
     (POLES, ["poles = ['-3', '-4', '-5', '-6']", "absent where placement_gain is"]),
     (WEIGHTS[:5], ["Q = [200.0, 1.0, 1000.0, 1.0]", "absent where lqr_gain is"]),
     (WEIGHTS[5:], ["R = 0.0001", "absent where lqr_gain is"]),

@@ -157,6 +157,12 @@ def test_what_is_no_real_number_is_refused(cls, field, allowed, unit, value, sho
         build(cls, **{field: value})
 
 
+@pytest.mark.parametrize("text", ["a\nb", "a\r\nb", "\x1b[31m", "\x07", "a\u2028b"])
+def test_an_error_is_one_line_without_control_characters_whatever_was_given(text):
+    for error in (InputError(text, 1, "x"), InputError("x", text, "x"), InputError("x", 1, text)):
+        assert str(error).isprintable()
+
+
 @pytest.mark.parametrize("infinite", [(Motor, "voltage_limit"), (ProtocolMetrics, "track_limit")])
 def test_the_two_limits_may_be_infinite(infinite):
     cls, field = infinite

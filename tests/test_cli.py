@@ -75,6 +75,14 @@ def as_plain(value):
     return io._numbers(json.loads(io.dump_json(value)))
 
 
+def assert_notes(result, *beginnings):
+    """Standard error has these notes, each on one line, and nothing else."""
+    lines = result.err.splitlines()
+    assert len(lines) == len(beginnings), result.err
+    for line, beginning in zip(lines, beginnings, strict=True):
+        assert re.match(rf"cpjax [a-z-]+: note: {re.escape(beginning)}", line), line
+
+
 # --- swingup ----------------------------------------------------------------------------------------------------------
 
 
@@ -104,15 +112,18 @@ def test_a_swing_up_that_does_not_settle_exits_with_1_and_says_so(command, tmp_p
 def test_a_run_that_blows_up_exits_with_1_and_names_its_flag(command, tmp_path, no_pictures):
     blow_up = ("--theta", "0.1", "--gain", "1e6", "1e6", "-1000000", "-1000000", "--voltage-limit", "inf")
     result = command("swingup", "--out", tmp_path, *SHORT, *blow_up)
-    assert (result.code, result.err) == (1, "")
+    assert result.code == 1
+    assert_notes(result, "the controller has an unstable regulator: upright it has a closed-loop pole at 4.29e+05 1/s")
     assert "did not settle (runaway)" in result.out
+    assert re.search(r"why: the state left all bounds at .* s; .* try a smaller dt\n", result.out)
     assert strict_json(tmp_path / "swingup.json")["flag"] == "runaway"
 
 
 @pytest.mark.parametrize("number", ["-5e-3", "-1E2", "-.5", "-1.e0"])
 def test_negative_numbers_may_be_written_with_an_exponent(command, tmp_path, no_pictures, number):
     result = command("swingup", "--out", tmp_path, *SHORT, "--kick", number, "--gain", number, "1", number, "2")
-    assert (result.code, result.err) == (1, "")
+    assert result.code == 1
+    assert_notes(result, "the controller has an unstable regulator: upright it has a closed-loop pole at ")
     controller = document(tmp_path)["controller"]
     assert controller["swing_up"]["kick"] == float(number)
     assert controller["regulator"]["K"] == [[float(number), 1.0, float(number), 2.0]]
@@ -199,6 +210,17 @@ CASES = [
 ]
 
 
+PARTS_OF_A_MOTOR = (
+    *("torque_constant", "back_emf_constant", "resistance", "rotor_inertia", "viscous_friction"),
+    *("wheel_radius", "gear_ratio"),
+)
+NOTED = {
+    **{f"plant.{name}": ("the motor was given in part; left at the appendix plant's",) for name in PARTS_OF_A_MOTOR},
+    "controller.K": ("the controller has an unstable regulator: upright it has a closed-loop pole at 4.64 1/s",),
+}
+"""What is said on standard error, by the first option of a case."""
+
+
 def flags_of(case):
     names = {f"{option.section}.{option.key}": option.name for option in OPTIONS}
     words = ((names[k], *map(str, v)) if isinstance(v, list) else (names[k], str(v)) for k, v in case.items())
@@ -236,12 +258,15 @@ def test_an_option_does_the_same_from_the_shell_and_from_a_file_and_does_somethi
     base = flags_of({key: value for key, value in given.items() if key not in case})
     shell = command("swingup", "--out", tmp_path / "shell", *base, *flags_of(case))
     file = command("swingup", "--out", tmp_path / "file", *base, "--config", tmp_path / "run.toml")
-    assert (shell.code, shell.err) == (file.code, file.err) == (1, "")
+    assert (shell.code, shell.err) == (file.code, file.err)
+    assert shell.code == 1
+    assert_notes(shell, *NOTED.get(next(iter(case)), ()))
     assert document(tmp_path / "shell") == document(tmp_path / "file")
     different = {k for k, v in document(tmp_path / "shell").items() if v != default_document[k]}
-    expected = {key.split(".")[0] for key in case}
+    expected = {key.split(".")[0] for key in case} | ({"notes"} if next(iter(case)) in NOTED else set())
     assert expected <= different
     assert different <= expected | {"metrics", "trajectory", "flag", "controller"}
+    assert document(tmp_path / "shell")["notes"] == [line.split(": note: ")[1] for line in shell.err.splitlines()]
     assert "controller" not in different or expected & {"plant", "controller"}  # the law's model is the plant
 
 

@@ -1,5 +1,6 @@
 """Files: what is saved is what is loaded, to the bit; what is broken is refused; a write is all or nothing."""
 
+import importlib.metadata
 import json
 import math
 import os
@@ -354,6 +355,91 @@ def test_a_path_with_a_null_in_it_is_refused(tmp_path):
             use(str(tmp_path / "a\0b.json"))
 
 
+def test_arrays_of_five_dtypes_are_read_and_no_other(tmp_path):
+    for dtype in ("float32", "float64", "int32", "int64", "bool"):
+        values = "true" if dtype == "bool" else "1"
+        text = '{"type": "State", "x": {"dtype": "%s", "values": %s}, "x_dot": 0, "theta": 0, "theta_dot": 0}'
+        assert io.load(written(tmp_path, "state.json", text % (dtype, values))).x.dtype == dtype
+    for dtype in ("longdouble", "float16", "int8", "uint32", "complex64", "object", "<f4", "f4", "S3", "M8[s]"):
+        with refused("x", "dtype one of bool, int32, int64, float32, float64"):
+            io.load(written(tmp_path, "state.json", text % (dtype, "1")))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "values"),
+    [
+        ("int32", "1.5"),
+        ("int32", "3000000000"),
+        ("int64", "1" + 30 * "0"),
+        ("bool", "2"),
+        ("float32", "1e300"),
+        ("float64", "true"),
+        ("float64", '"1"'),
+        ("float64", "null"),
+        ("float32", "[[1], [1, 2]]"),
+        ("float32", "{}"),
+    ],
+)
+def test_values_that_are_no_numbers_of_their_dtype_are_refused(tmp_path, dtype, values):
+    text = f'{{"type": "AngleGate", "half_angle": {{"dtype": "{dtype}", "values": {values}}}}}'
+    with refused("half_angle", "dtype and values that fit each other"):
+        io.load(written(tmp_path, "gate.json", text))
+
+
+@pytest.mark.parametrize("dtype", [np.longdouble, np.float16, np.int8, np.uint32], ids=lambda d: d.__name__)
+@both_formats
+def test_an_array_that_no_file_could_give_back_is_not_written(tmp_path, dtype, extension):
+    with refused("State.x", "of dtype bool, int32, int64, float32, float64"):
+        io.save(tmp_path / f"state.{extension}", State(dtype(1), 0.0, 0.0, 0.0))
+    assert list(tmp_path.iterdir()) == []
+
+
+REST = '"x_dot": 0, "theta": 0, "theta_dot": 0'
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "field"),
+    [
+        ("a.json", f'{{"type": "State", "x": "left", {REST}}}', "State.x"),
+        ("a.json", f'{{"type": "State", "x": null, {REST}}}', "State.x"),
+        ("a.json", f'{{"type": "State", "x": true, {REST}}}', "State.x"),
+        ("a.json", f'{{"type": "State", "x": {{"type": "Motor"}}, {REST}}}', "State.x"),
+        ("a.toml", 'type = "State"\nx = 2026-01-01\nx_dot = 0\ntheta = 0\ntheta_dot = 0', "State.x"),
+        ("a.toml", 'type = "State"\nx = 0\nx_dot = 0\ntheta = 07:32:00\ntheta_dot = 0', "State.theta"),
+    ],
+)
+def test_a_state_of_other_things_than_numbers_is_refused_by_name(tmp_path, name, text, field):
+    with refused(field, "a number or an array of numbers"):
+        io.load(written(tmp_path, name, text))
+
+
+@pytest.mark.parametrize("field", ["success", "effort", "flag"])
+@pytest.mark.parametrize("value", [None, "a text", {"type": "Motor"}], ids=str)
+def test_metrics_of_other_things_than_numbers_are_refused_by_name(tmp_path, field, value):
+    table = {**io.encode(METRICS), field: value}
+    io.write_json(tmp_path / "metrics.json", table)
+    with refused(f"Metrics.{field}", "a number or an array of numbers"):
+        io.load(tmp_path / "metrics.json")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("state", 1.0), ("state", {"type": "Motor"}), ("metrics", "x"), ("time", {"type": "Motor"})]
+)
+def test_a_trajectory_of_other_parts_is_refused_by_name(tmp_path, field, value):
+    io.write_json(tmp_path / "run.json", {**io.encode(THINGS["Trajectory"]), field: value})
+    with refused(f"Trajectory.{field}"):
+        io.load(tmp_path / "run.json")
+
+
+def test_a_result_of_a_command_is_no_component_but_has_parts(tmp_path):
+    path = tmp_path / "result.json"
+    io.write_json(path, {"what": "one closed-loop rollout", "plant": io.encode(PLANT), "controller": io.encode(LAW)})
+    with refused("path", "a file with one component; this one holds a result (one closed-loop rollout)"):
+        io.load(path)
+    assert_bits(io.load_part(path, "plant", "a CartPole"), PLANT)
+    assert_bits(io.load_part(path, "controller", "a law"), LAW)
+
+
 # --- what is refused when written -------------------------------------------------------------------------------------
 
 
@@ -512,6 +598,16 @@ def test_lists_of_numbers_stand_on_one_line(tmp_path):
 def test_versions_name_what_a_result_depends_on():
     assert set(io.versions()) == {"cpjax", "jax", "jaxlib", "numpy", "scipy"}
     assert io.versions()["numpy"] == np.__version__
+
+
+def test_versions_of_a_tree_that_was_never_installed_are_unknown(monkeypatch):
+    def version(name):
+        if name == "cpjax":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    assert io.versions() == {"cpjax": "0+unknown", "jax": "1.0", "jaxlib": "1.0", "numpy": "1.0", "scipy": "1.0"}
 
 
 def test_a_relative_path_without_a_folder_is_written_here(tmp_path, monkeypatch):

@@ -2,21 +2,31 @@
 
 import argparse
 import importlib
+import os
 import re
+import signal
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
+from cpjax import startup
+from cpjax.cli import output
+from cpjax.cli.output import complain
 from cpjax.errors import InputError
 
 EXIT_CODES = """\
 exit codes:
   0    done (swingup: and the pendulum settled; tune: from one start at least)
   1    swingup, tune: done, but the pendulum did not settle
-  2    bad input: one line on standard error names the field, the value and what is allowed
+  2    bad input, or an output that cannot be written (a full disk): one line on standard error says what is wrong
   130  interrupted
+
+Files are written whatever becomes of standard output. A reader of it that goes away (`cpjax design | head -1`), or a
+standard output that is closed, changes no exit code.
 """
 
+INTERRUPTED = 130
 
 _COMMANDS = (
     "swingup",
@@ -45,7 +55,8 @@ class _Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(rf"-{real}([-+]{real}[ij]|[ij])?$|-inf$|-nan$")
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: error: {message}\n")
+        complain(f"{self.prog}: error: {message}")
+        self.exit(2)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -65,22 +76,34 @@ def make_parser() -> argparse.ArgumentParser:
 
 def command() -> int:
     """What the shell calls: `main`, in a process of its own, whose JAX may be set up for the command."""
-    return main(set_up=True)
+    code = main(set_up=True)
+    output.settle()
+    if code == INTERRUPTED:
+        os._exit(code)  # JAX, interrupted in the middle of a compilation, may crash while Python cleans up
+    return code
 
 
 def main(arguments: Sequence[str] | None = None, *, set_up: bool = False) -> int:
     """Runs one command and returns its exit code; see `EXIT_CODES`.
 
     Args:
-      set_up: keep what is compiled for the next process, and set up the CPU where the command simulates many starts.
-        Only before JAX has started.
+      set_up: keep what is compiled for the next process, set up the CPU where the command simulates many starts, and
+        print no warnings of libraries. Only before JAX has started.
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
-    try:
-        return _run(given, set_up)
-    except KeyboardInterrupt:
-        print(f"cpjax {given[0] if given else ''}: interrupted; what was saved so far is kept", file=sys.stderr)
-        return 130
+    with output.streams() as out:
+        try:
+            code = _run(given, set_up)
+        except KeyboardInterrupt:
+            if set_up:  # what is left to do takes no time, and a second interrupt would end it with a traceback
+                signal.signal(signal.SIGINT, signal.SIG_IGN)
+            complain(f"cpjax {given[0] if given else ''}: interrupted; what was saved so far is kept")
+            code = INTERRUPTED
+        out.flush()
+        if out.problem is not None:
+            complain(f"cpjax {given[0] if given else ''}: error: standard output cannot be written: {out.problem}")
+            code = 2 if code in (0, 1) else code
+    return code
 
 
 def _run(arguments: list[str], set_up: bool) -> int:
@@ -94,6 +117,7 @@ def _run(arguments: list[str], set_up: bool) -> int:
         return int(stop.code or 0)
 
     import jax
+    import numpy as np
 
     if set_up:
         from cpjax import runtime
@@ -101,19 +125,23 @@ def _run(arguments: list[str], set_up: bool) -> int:
         runtime.keep_compilations()
         if getattr(options, "many_starts", False):
             runtime.configure_cpu()
+        startup.ready()  # until here an interrupt ends the process at once: nothing has been written
+        if not sys.warnoptions:  # what matters of them is in the results, as a flag, or in an error
+            warnings.simplefilter("ignore")
     # The protocol's figures are float64. Set here, in the application: the library never touches JAX's settings.
     jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # JAX has no annotations for it
     try:
-        code: int = options.run(options)
+        with np.errstate(all="ignore"):  # an overflow shows in the result, or in the one line of an error
+            code: int = options.run(options)
         return code
     except InputError as problem:
-        print(f"cpjax {options.command}: error: {problem}", file=sys.stderr)
+        complain(f"cpjax {options.command}: error: {problem}")
         return 2
     except OSError as problem:  # a name too long, a disk that is full: what libraries have no better words for
-        if problem.filename is None:
+        if problem.errno is None:
             raise
-        said = InputError("path", problem.filename, f"a place that can be read and written ({problem.strerror})")
-        print(f"cpjax {options.command}: error: {said}", file=sys.stderr)
+        allowed = f"a place that can be read and written ({problem.strerror})"
+        complain(f"cpjax {options.command}: error: {InputError('path', problem.filename, allowed)}")
         return 2
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from cpjax import io
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import (
     PLANT_OPTIONS,
     START_OPTIONS,
@@ -17,6 +18,7 @@ from cpjax.cli.options import (
     named_hybrid,
     resolve,
 )
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
@@ -66,11 +68,13 @@ def run(given: argparse.Namespace) -> int:
     if len(set(names)) < len(names):
         raise InputError("controllers", names, "each one once")
     controllers = {name: named_hybrid(name, plant) for name in names}
+    notes = notes_on(sections["plant"], plant, controllers)
+    announce("animate", notes)
     start = build_start(sections["start"], given.seed)
-    path, runs = animated(given.out, plant, controllers, start, chosen, seed=given.seed)
+    path, runs = animated(given.out, plant, controllers, start, chosen, seed=given.seed, notes=notes)
     for name, one in runs.items():
-        print(f"{controller_title(name)}: {verdict(one, chosen['duration'])}")
-    print(f"wrote {path} and animation.json")
+        say(f"{controller_title(name)}: {verdict(one, chosen['duration'])}")
+    say(f"wrote {path} and animation.json")
     return 0
 
 
@@ -103,7 +107,7 @@ def animated(
     kind = chosen["format"]
     if kind == "mp4" and encoder() is None:
         kind = "html"
-        print("no ffmpeg: writing a page of HTML instead of an MP4")
+        say("no ffmpeg: writing a page of HTML instead of an MP4")
     path = out / f"animation.{kind}"
     with progress("animate") as report:
         save_animation(path, scenes, duration=duration, rate=chosen["rate"], report=report)

@@ -4,10 +4,12 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import PLANT_OPTIONS, Option, Sections, add_options, build_plant, parse_poles, resolve
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
-from cpjax.errors import InputError
+from cpjax.errors import InputError, MissingError
 from cpjax.study.forensics import GainAudit, audit_gains, write
 from cpjax.study.plant_fit import PARAMETERS
 from cpjax.study.printed_gains import PrintedGain, printed_in_the_paper
@@ -40,6 +42,7 @@ def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
+    announce("audit-gains", notes_on(sections["plant"], plant))
     prints = _prints(sections["gains"])
     setting = _setting(sections)
     with progress("audit-gains") as report:
@@ -52,8 +55,8 @@ def run(given: argparse.Namespace) -> int:
 
     save_figure(given.out / "audit_gains.png", picture(audit))
     print_audit(audit, plant)
-    print(*findings(audit), sep="\n")
-    print(f"wrote {path} and {given.out / 'audit_gains.png'}")
+    say(*findings(audit))
+    say(f"wrote {path} and {given.out / 'audit_gains.png'}")
     return 0
 
 
@@ -79,12 +82,12 @@ def _prints(given: Mapping[str, Any]) -> list[PrintedGain]:
     prints = []
     if "placement_gain" in given:
         if "poles" not in given:
-            raise InputError("poles", None, "given: a placement gain is designed for poles")
+            raise MissingError("poles", "a placement gain is designed for poles")
         prints.append(PrintedGain.placement(given["placement_gain"], parse_poles(given["poles"])))
     if "lqr_gain" in given:
         for key in ("Q", "R"):
             if key not in given:
-                raise InputError(key, None, "given: an lqr gain is designed for weights")
+                raise MissingError(key, "an lqr gain is designed for weights")
         prints.append(PrintedGain.lqr(given["lqr_gain"], given["Q"], given["R"]))
     for key, gain in (("poles", "placement_gain"), ("Q", "lqr_gain"), ("R", "lqr_gain")):
         if key in given and gain not in given:

@@ -1,11 +1,12 @@
 """`cpjax audit-gradients`: can gradients through this loop be trusted? A table, a picture and JSON."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from cpjax import io
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import (
     CONTROLLER_OPTIONS,
     PLANT_OPTIONS,
@@ -15,7 +16,8 @@ from cpjax.cli.options import (
     build_plant,
     resolve,
 )
-from cpjax.cli.progress import progress
+from cpjax.cli.output import say
+from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
@@ -50,7 +52,9 @@ def run(given: argparse.Namespace) -> int:
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     controller = build_hybrid(sections["controller"], plant)
-    audit = audited(given.out, plant, controller, sections["audit"], given.seed)
+    notes = notes_on(sections["plant"], plant, {"the controller": controller})
+    announce("audit-gradients", notes)
+    audit = audited(given.out, plant, controller, sections["audit"], given.seed, notes)
 
     from cpjax.show.gradients import TITLE, cells, findings, header
 
@@ -60,12 +64,14 @@ def run(given: argparse.Namespace) -> int:
         print_table(
             "Starts whose gradients are not to be trusted", ("start", "verdict", "why"), doubtful, text_columns=3
         )
-    print(*findings(audit), sep="\n")
-    print(f"wrote {given.out / 'audit_gradients.json'} and {given.out / 'audit_gradients.png'}")
+    say(*findings(audit))
+    say(f"wrote {given.out / 'audit_gradients.json'} and {given.out / 'audit_gradients.png'}")
     return 0
 
 
-def audited(out: Path, plant: CartPole, controller: Hybrid, setting: Mapping[str, Any], seed: int) -> GradientAudit:
+def audited(
+    out: Path, plant: CartPole, controller: Hybrid, setting: Mapping[str, Any], seed: int, notes: Sequence[str] = ()
+) -> GradientAudit:
     """The audit, with its JSON and picture written; `setting` is by the options' keys, what is missing by default."""
     setting = {"starts": "hanging", "count": 16, "duration": 4.0, "dt": 1e-3, **setting}
     starts = sample_starts(setting["starts"], setting["count"], seed=seed)
@@ -78,9 +84,9 @@ def audited(out: Path, plant: CartPole, controller: Hybrid, setting: Mapping[str
             scales=chosen.scales,
             duration=setting["duration"],
             dt=setting["dt"],
-            progress=report,
+            progress=compiling(report, "located"),
         )
-    loop = {"plant": io.encode(plant), "controller": io.encode(controller)}
+    loop = {"plant": io.encode(plant), "controller": io.encode(controller), "notes": notes}
     described = document(audit, starts, seed=seed, setting=setting, parameters=chosen.parameters, **loop)
     io.write_json(out / "audit_gradients.json", described)
 

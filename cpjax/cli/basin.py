@@ -4,14 +4,16 @@ import argparse
 import dataclasses
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cpjax import io
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, controller_title, named_hybrid, resolve
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
@@ -77,20 +79,28 @@ def run(given: argparse.Namespace) -> int:
     if len({file_of(name) for name in names}) < len(names):
         raise InputError("controllers", names, "each one once, and with names that differ in more than their endings")
     controllers = {name: named_hybrid(name, plant) for name in names}
+    notes = notes_on(sections["plant"], plant, controllers)
+    announce("basin", notes)
     setting = {"duration": 10.0, "dt": 0.002, **sections["run"]}
     begin = time.perf_counter()
     chart = chart_of(chosen, given.seed)
-    rows = drawn(given.out, given.out / "basin.parts", plant, controllers, chart, setting)
+    rows = drawn(given.out, given.out / "basin.parts", plant, controllers, chart, setting, notes)
     seconds = time.perf_counter() - begin
     print_table(*table(rows), text_columns=1)
     steps = len(names) * chart.up.cells * chart.across.cells * round(setting["duration"] / setting["dt"])
-    print(f"{steps / 1e6:,.0f} M steps in {seconds:.1f} s, compilation, files and picture included")
-    print(f"wrote {given.out / 'basin.json'}, basin.png and the runs of each map")
+    say(f"{steps / 1e6:,.0f} M steps in {seconds:.1f} s, compilation, files and picture included")
+    say(f"wrote {given.out / 'basin.json'}, basin.png and the runs of each map")
     return 0
 
 
 def drawn(
-    out: Path, parts: Path, plant: CartPole, controllers: Mapping[str, Hybrid], chart: Map, setting: dict[str, Any]
+    out: Path,
+    parts: Path,
+    plant: CartPole,
+    controllers: Mapping[str, Hybrid],
+    chart: Map,
+    setting: dict[str, Any],
+    notes: Sequence[str] = (),
 ) -> dict[str, dict[str, Any]]:
     """The maps of all controllers in a few numbers, with basin.json, basin.png and their runs written when all are
     done. Until then everything is in the folder `parts`, and what an earlier map left in `out` stays as it is.
@@ -116,7 +126,7 @@ def drawn(
         for file in files.values():
             (parts / file).replace(out / file)
         io.write_bytes(out / "basin.png", picture)
-        io.write_json(out / "basin.json", {**request, "basins": rows, "files": files})
+        io.write_json(out / "basin.json", {**request, "basins": rows, "files": files, "notes": notes})
     return rows
 
 

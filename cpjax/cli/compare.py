@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from cpjax import io, paper
-from cpjax.cli.options import EVALUATION_OPTIONS, PLANT_OPTIONS, Option, add_options, build_plant, resolve
+from cpjax.cli.notes import announce, notes_on
+from cpjax.cli.options import EVALUATION_OPTIONS, PLANT_OPTIONS, Option, add_options, build_plant, resolve, saved
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid, LqrWeights, PoleFactors
@@ -16,7 +18,7 @@ from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.sim.rollout import rollout
 from cpjax.state import NAMES, State
-from cpjax.study.comparison import Compared, best, compare, document, entries
+from cpjax.study.comparison import Compared, Entry, best, compare, document, entries
 from cpjax.study.reproduction import DESIGNS, Setting
 
 OPTIONS = [
@@ -47,13 +49,15 @@ def run(given: argparse.Namespace) -> int:
     files = dict(sections["tuned"])
     limit = files.pop("track_limit", float("inf"))
     tuned = {design: _loaded(design, files[design]) for design in DESIGNS if design in files}
-    results, shown_start = compared(given.out, plant, setting, tuned, limit)
+    notes = notes_on(sections["plant"], plant, {_name(one): one.controller for one in entries(plant, tuned)})
+    announce("compare", notes)
+    results, shown_start = compared(given.out, plant, setting, tuned, limit, notes)
 
     from cpjax.show.comparison import findings
 
     print_results(results)
-    print(*findings(results), f"responses.png and phase.png show start {shown_start}.", sep="\n")
-    print(f"wrote {given.out / 'compare.json'} and the pictures beside it")
+    say(*findings(results), f"responses.png and phase.png show start {shown_start}.")
+    say(f"wrote {given.out / 'compare.json'} and the pictures beside it")
     return 0
 
 
@@ -63,6 +67,7 @@ def compared(
     setting: Setting,
     tuned: Mapping[paper.Design, Hybrid],
     track_limit: float = float("inf"),
+    notes: Sequence[str] = (),
 ) -> tuple[list[Compared], str]:
     """The comparison, with its JSON and pictures written, and which start the pictures of one run show; `tuned` is by
     design, what is missing from the presets.
@@ -77,7 +82,7 @@ def compared(
     }
     start, chosen_because = representative_start(starts, list(best_ones.values()))
     shown_start = {"state": io.encode(start), "is": chosen_because}
-    described = document(plant, results, setting, track_limit=track_limit, shown_start=shown_start)
+    described = document(plant, results, setting, track_limit=track_limit, shown_start=shown_start, notes=notes)
     io.write_json(out / "compare.json", described)
 
     from cpjax.show.comparison import by_start, phase_portraits, responses
@@ -111,8 +116,12 @@ def print_results(results: list[Compared]) -> None:
     print_table("Means over the successful runs", HEADER, map(cells, results), text_columns=3)
 
 
+def _name(entry: Entry) -> str:
+    return f"{entry.name}, {entry.design}" + ("" if entry.gains == "tuned" else f", {entry.gains}")
+
+
 def _loaded(design: str, path: str) -> Hybrid:
-    loaded = io.load(path)
+    loaded = saved(path, f"tuned-{design}")
     if not isinstance(loaded, Hybrid):
         raise InputError(f"tuned-{design}", path, "a file that holds a Hybrid")
     wanted = LqrWeights if design == "lqr" else PoleFactors

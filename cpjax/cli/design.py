@@ -4,7 +4,9 @@ import argparse
 from typing import Any
 
 from cpjax import io
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import CONTROLLER_OPTIONS, PLANT_OPTIONS, add_options, build_hybrid, build_plant, resolve
+from cpjax.cli.output import say
 from cpjax.cli.tables import print_table
 from cpjax.study.design_check import check_design, document
 
@@ -27,18 +29,23 @@ def run(given: argparse.Namespace) -> int:
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     controller = build_hybrid(sections["controller"], plant)
+    notes = notes_on(sections["plant"], plant, {"the controller": controller})
+    announce("design", notes)
     regulator: Any = controller.regulator
     check = check_design(plant, regulator, controller.gate)
     path = given.out / "design.json"
-    setting = {"seed": given.seed, "plant": io.encode(plant), "controller": io.encode(controller)}
+    setting = {"seed": given.seed, "plant": io.encode(plant), "controller": io.encode(controller), "notes": notes}
     io.write_json(path, document(check, **setting))
 
-    from cpjax.show.design import picture, rows
+    from cpjax.show.design import instability, picture, rows
     from cpjax.show.figures import save_figure
 
     limit = float(plant.motor.voltage_limit)
     title = "u = -K s with K = " + ", ".join(f"{k:.5g}" for k in check.K[0])
     save_figure(given.out / "design.png", picture(check, controller.gate, limit, title))
+    unstable = instability(check)
+    if unstable is not None:
+        say(unstable)
     print_table(title, ("check", "value", "unit"), rows(check, limit), text_columns=3)
-    print(f"wrote {path} and {given.out / 'design.png'}")
+    say(f"wrote {path} and {given.out / 'design.png'}")
     return 0

@@ -8,6 +8,7 @@ come from the fields of the classes themselves.
 import argparse
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
@@ -15,6 +16,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from cpjax import io, paper
+from cpjax.cli.notes import papers_own
 from cpjax.controllers import (
     AngleGate,
     AngleRateGate,
@@ -29,7 +31,7 @@ from cpjax.controllers.gates import Gate
 from cpjax.controllers.protocol import Controller, as_controller
 from cpjax.design.lqr import lqr
 from cpjax.design.placement import place
-from cpjax.errors import InputError
+from cpjax.errors import InputError, MissingError
 from cpjax.plant import CartPole, Motor, linearize, with_parameters
 from cpjax.presets import PRESETS, preset
 from cpjax.pytree import Number, rules
@@ -52,11 +54,11 @@ class Option:
     help: str
     type: type = str
     choices: Sequence[str] | None = None
-    count: int | Literal["+"] | None = None
-    """How many values; "+" for one or more."""
+    count: int | tuple[int, int] | Literal["+"] | None = None
+    """How many values; "+" for one or more; of two numbers either."""
     flag: str | None = None
     numbers: bool = False
-    """Whether a file may give a text as a number."""
+    """Whether a file may give a text as a number, or as a pair of real and imaginary part."""
 
     @property
     def name(self) -> str:
@@ -78,7 +80,7 @@ _GATES: Mapping[str, type[AngleGate | AngleRateGate | LyapunovGate]] = {
 }
 
 PLANT_OPTIONS = [
-    Option("plant", "base", f"{_PLANTS}, or a file; other plant options change it (default appendix)", flag="plant"),
+    Option("plant", "base", f"{_PLANTS}, or a plant's file; other options change it (default appendix)", flag="plant"),
     *numbers_of("plant", CartPole),
     *numbers_of("plant", Motor),
 ]
@@ -87,7 +89,7 @@ CONTROLLER_OPTIONS = [
     Option(
         "controller",
         "file",
-        "tuned_lqr, tuned_place or a controller saved by cpjax, instead of all options below",
+        "tuned_lqr, tuned_place, a controller saved by cpjax or a result with one, instead of all options below",
         flag="controller",
     ),
     Option("controller", "law", "swing-up law (default corrected-centred)", choices=tuple(paper.LAWS)),
@@ -95,10 +97,17 @@ CONTROLLER_OPTIONS = [
     Option(
         "controller",
         "gains",
-        "the paper's, or computed for the plant (default printed)",
+        "the paper's, or computed for the plant (default printed for the paper's plants, and else computed)",
         choices=("printed", "computed"),
     ),
-    Option("controller", "Q", "LQR for the plant: diagonal of the state weight", float, count=4, flag="q"),
+    Option(
+        "controller",
+        "Q",
+        "LQR for the plant: diagonal of the state weight, or all of its 16 numbers, row by row",
+        float,
+        count=(4, 16),
+        flag="q",
+    ),
     Option("controller", "R", "and the weight of the voltage (default the paper's 1e-4)", float, flag="r"),
     Option("controller", "poles", "placement for the plant: poles, such as -3 -4 -5+2j -5-2j", count=4, numbers=True),
     Option("controller", "K", "the regulator's gain itself, instead of all these", float, count=4, flag="gain"),
@@ -149,10 +158,23 @@ def add_options(parser: argparse.ArgumentParser, options: Sequence[Option], *, o
                 dest=f"{option.section}.{option.key}",
                 type=option.type,
                 choices=option.choices,
-                nargs=option.count,
+                nargs="+" if isinstance(option.count, tuple) else option.count,
+                action=_one_of(option.count) if isinstance(option.count, tuple) else "store",
                 metavar=None if option.choices else option.key.upper(),
                 help=option.help + (f" (key: {option.key})" if option.flag else ""),
             )
+
+
+def _one_of(counts: tuple[int, int]) -> type[argparse.Action]:
+    """Stores so many values, or so many."""
+
+    class Store(argparse.Action):
+        def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+            if len(values) not in counts:
+                raise argparse.ArgumentError(self, f"expected {counts[0]} arguments, or {counts[1]}")
+            setattr(namespace, self.dest, values)
+
+    return Store
 
 
 def resolve(given: argparse.Namespace, options: Sequence[Option]) -> Sections:
@@ -169,6 +191,12 @@ def resolve(given: argparse.Namespace, options: Sequence[Option]) -> Sections:
         if value is not None:
             sections[option.section][option.key] = value
     return sections
+
+
+def _counted(count: int | tuple[int, int] | Literal["+"] | None) -> str:
+    if count == "+":
+        return "a list of values"
+    return f"a list of {' or '.join(map(str, count)) if isinstance(count, tuple) else count} values"
 
 
 def _read_config(path: Path, options: Sequence[Option], sections: dict[str, dict[str, Any]]) -> None:
@@ -193,12 +221,17 @@ def _checked_value(field: str, value: Any, option: Option) -> Any:
     kinds = {float: ((int, float), "a number"), int: ((int,), "a whole number"), str: ((str,), "a text")}
     python_types, words = kinds[option.type]
     several = option.count is not None
-    if several and not (isinstance(value, list) and value and option.count in ("+", len(value))):
-        raise InputError(
-            field, value, "a list of values" if option.count == "+" else f"a list of {option.count} values"
-        )
+    if isinstance(option.count, tuple) and isinstance(value, list) and any(isinstance(row, list) for row in value):
+        size = math.isqrt(max(option.count))
+        if len(value) != size or not all(isinstance(row, list) and len(row) == size for row in value):
+            raise InputError(field, value, f"{size} rows of {size} values, or {_counted(option.count)}")
+        value = [one for row in value for one in row]
+    counts = option.count if isinstance(option.count, tuple) else (option.count,)
+    if several and not (isinstance(value, list) and value and ("+" in counts or len(value) in counts)):
+        raise InputError(field, value, _counted(option.count))
     if option.numbers:
-        value = [str(v) if isinstance(v, (int, float)) and not isinstance(v, bool) else v for v in value]
+        value = [_complex_text(one) for one in value]
+        words = "texts such as '-5+2j', numbers, or pairs of numbers [real, imaginary]"
     for one in value if several else [value]:
         if isinstance(one, bool) or not isinstance(one, python_types):
             raise InputError(field, value, words)
@@ -207,6 +240,14 @@ def _checked_value(field: str, value: Any, option: Option) -> Any:
         if option.choices is not None and one not in option.choices:
             raise InputError(field, value, "one of " + ", ".join(option.choices))
     return value
+
+
+def _complex_text(value: Any) -> Any:
+    """A number, or a pair of real and imaginary part, as the text that the flag would have been given."""
+    parts = value if isinstance(value, list) and len(value) == 2 else [value]
+    if any(isinstance(one, bool) or not isinstance(one, (int, float)) for one in parts):
+        return value
+    return str(value) if len(parts) == 1 else f"{parts[0]}{float(parts[1]):+}j"
 
 
 def build_plant(given: Mapping[str, Any]) -> CartPole:
@@ -218,9 +259,9 @@ def build_plant(given: Mapping[str, Any]) -> CartPole:
     else:
         if Path(base).suffix.lower() not in (".json", ".toml"):
             raise InputError("plant", base, f"{_PLANTS}, or a file that ends in .json or .toml")
-        plant = io.load(base)
+        plant = io.load_part(base, "plant", "a CartPole")
         if not isinstance(plant, CartPole):
-            raise InputError("plant", base, "a file that holds a CartPole")
+            raise InputError("plant", base, f"a file that holds a CartPole; this one holds a {type(plant).__name__}")
     return with_parameters(plant, changes)
 
 
@@ -254,12 +295,18 @@ def saved_controller(name: str, also: str = "") -> Controller:
     if Path(name).suffix.lower() not in (".json", ".toml"):
         presets = ", ".join(PRESETS.values())
         raise InputError("controller", name, f"{presets}, {also}or the name of a file that ends in .json or .toml")
+    return saved(name, "controller")
+
+
+def saved(path: str, field: str) -> Controller:
+    """The controller in a file, or in a result that a command wrote; `field` is what the error names."""
+    wanted = "a controller or a law"
+    loaded = io.load_part(path, "controller", wanted)
     try:
-        return as_controller(io.load(name))
+        return as_controller(loaded)
     except InputError as problem:
-        if problem.field != "controller":
-            raise
-        raise InputError("controller", name, "a file that holds a controller or a law") from problem
+        allowed = f"a file that holds {wanted}; this one holds a {type(loaded).__name__}"
+        raise InputError(field, path, allowed) from problem
 
 
 def named_hybrid(name: str, plant: CartPole) -> Hybrid:
@@ -267,8 +314,9 @@ def named_hybrid(name: str, plant: CartPole) -> Hybrid:
     law, *others = name.split("/")
     if law in paper.LAWS and Path(name).suffix.lower() not in (".json", ".toml"):
         for design, gains in itertools.product(get_args(paper.Design), get_args(paper.Gains)):
-            if others in ([design], [design, gains]):  # "printed" comes first
-                return paper.controller(law, design, plant, gains)
+            if others in ([design], [design, gains]):
+                chosen = gains if len(others) == 2 else default_gains(plant)
+                return paper.controller(law, design, plant, chosen)
         raise InputError("controller", name, f"{law}/lqr or {law}/placement, and after it /printed or /computed")
     controller = saved_controller(name, f"a law ({', '.join(paper.LAWS)}) with its regulator, such as corrected/lqr, ")
     if not isinstance(controller, Hybrid):
@@ -323,22 +371,38 @@ def _build_regulator(changes: dict[str, Any], plant: CartPole, reference: State)
         Q, R = _weights(weights)
         K = _designed("gain", plant, lambda A, B: lqr(A, B, Q, R).K)
         return StateFeedback(K, reference, LqrWeights(Q, R[0][0]))
-    regulator = paper.regulator(given.get("design", "placement"), given.get("gains", "printed"), plant)
+    gains = given.get("gains") or default_gains(plant)
+    try:
+        regulator = paper.regulator(given.get("design", "placement"), gains, plant)
+    except InputError as problem:
+        if "gains" in given:
+            raise
+        hint = "; or give a gain of your own, or take the paper's with --gains printed"
+        raise InputError(problem.field, problem.value, problem.allowed + hint) from problem
     return dataclasses.replace(regulator, reference=reference)
+
+
+def default_gains(plant: CartPole) -> paper.Gains:
+    """The printed ones for the paper's own plants; what they would do on any other is nobody's question."""
+    return "computed" if papers_own(plant) is None else "printed"
 
 
 def _designed(what: str, plant: CartPole, design: Callable[[Any, Any], Any]) -> Any:
     """What `design` makes of the linear model; if that is impossible, it is the plant's fault as well."""
     try:
         return design(*linearize(plant))
-    except InputError as problem:
-        if problem.field not in ("A", "B"):
+    except (InputError, np.linalg.LinAlgError) as problem:
+        if isinstance(problem, InputError) and problem.field not in ("A", "B"):
             raise
         raise InputError("plant", plant, f"one for which this {what} can be computed ({problem})") from problem
 
 
 def _weights(given: Mapping[str, Any]) -> tuple[np.ndarray[Any, Any], list[list[float]]]:
-    return np.diag(given.get("Q", paper.Q)).astype(float), [[float(given.get("R", paper.R))]]
+    numbers = np.asarray(given.get("Q", paper.Q), dtype=float)
+    Q = np.diag(numbers) if numbers.size == 4 else numbers.reshape(4, 4)
+    if not np.array_equal(Q, Q.T, equal_nan=True):
+        raise InputError("Q", given["Q"], "a symmetric matrix")
+    return Q, [[float(given.get("R", paper.R))]]
 
 
 def parse_poles(texts: Sequence[str]) -> list[complex]:
@@ -364,7 +428,7 @@ def _build_gate(changes: dict[str, Any], plant: CartPole, reference: State, weig
             raise InputError(key, changes[key], f"absent: the gate {name} has no such term")
     for key in ("rate", "level"):
         if key in rules(cls) and key not in changes:
-            raise InputError(key, None, f"given: the gate {name} needs it")
+            raise MissingError(key, f"the gate {name} needs it")
     if cls is LyapunovGate:
         P = _designed("lyapunov gate", plant, lambda A, B: lqr(A, B, *_weights(weights)).P)
         return LyapunovGate(P, reference=reference, **changes)

@@ -2,14 +2,17 @@
 
 import argparse
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from cpjax import io, paper
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, resolve
-from cpjax.cli.progress import progress
+from cpjax.cli.output import say
+from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
@@ -72,16 +75,20 @@ def run(given: argparse.Namespace) -> int:
         if not _LOWEST_SUPPLY <= supply <= _HIGHEST_SUPPLY:
             raise InputError("supplies", supply, f"from {_LOWEST_SUPPLY:g} to {_HIGHEST_SUPPLY:g} V")
     plan = FrontPlan(seed=given.seed, **chosen)
-    found = made(given.out, given.out / "pareto.parts", plant, plan, supplies)
+    notes = notes_on(sections["plant"], plant)
+    announce("pareto", notes)
+    found = made(given.out, given.out / "pareto.parts", plant, plan, supplies, notes)
     print_table(*table(found), text_columns=2)
     from cpjax.show.front import findings
 
-    print(*findings(curves_of(found)), *costs(found), sep="\n")
-    print(f"wrote {given.out / 'pareto.json'}, pareto.png and supplies.png")
+    say(*findings(curves_of(found)), *costs(found))
+    say(f"wrote {given.out / 'pareto.json'}, pareto.png and supplies.png")
     return 0
 
 
-def made(out: Path, parts: Path, plant: CartPole, plan: FrontPlan, supplies: tuple[float, ...]) -> Found:
+def made(
+    out: Path, parts: Path, plant: CartPole, plan: FrontPlan, supplies: tuple[float, ...], notes: Sequence[str] = ()
+) -> Found:
     """The fronts of both designs, with pareto.json, pareto.png and supplies.png written; until then what is done is in
     the folder `parts`.
     """
@@ -98,6 +105,7 @@ def made(out: Path, parts: Path, plant: CartPole, plan: FrontPlan, supplies: tup
             "plan": dataclasses.asdict(plan),
             "plant": io.encode(plant),
             "fronts": found,
+            "notes": notes,
             "known": [{"name": name, "design": one.entry.design, **one.summary} for name, one in known],
         }
         draw(out, plant, found, known)
@@ -134,7 +142,15 @@ def traced(
     from cpjax.study.front import trace_fronts  # optax takes a while; other commands should not wait for it
 
     with progress(f"pareto, {design}") as report:
-        fronts = trace_fronts(plant, design, plan, measure.reference, supplies=supplies, report=report, memory=folder)
+        fronts = trace_fronts(
+            plant,
+            design,
+            plan,
+            measure.reference,
+            supplies=supplies,
+            report=compiling(report, "screening"),
+            memory=folder,
+        )
     rows = [
         {
             "supply": supply,

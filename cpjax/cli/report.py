@@ -7,6 +7,7 @@ from typing import Any
 
 from cpjax import __version__, io, paper
 from cpjax.cli.options import EVALUATION_OPTIONS, Option, add_options, resolve
+from cpjax.cli.output import say
 from cpjax.cli.reproduce import print_rows, rows_of
 from cpjax.errors import InputError
 from cpjax.study.basin import MOST_CELLS
@@ -47,7 +48,7 @@ def run(given: argparse.Namespace) -> int:
     with io.parts_of(given.out / "report.parts", asked) as parts:
         rows = written(given, parts, setting, per_axis, studies)
     print_rows(rows)
-    print(f"wrote {given.out / 'report.html'}")
+    say(f"wrote {given.out / 'report.html'}")
     return 0
 
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cpjax.cli.options import EVALUATION_OPTIONS, add_options, resolve
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.study.reproduction import Setting, reproduce
@@ -33,10 +34,10 @@ def run(given: argparse.Namespace) -> int:
     save_figure(given.out / "success.png", success_rates(rows))
     for name, figure, caption in pictures(setting):
         save_figure(given.out / f"{name}.png", figure)
-        print(caption)
+        say(caption)
     print_rows(rows)
-    print(*findings(rows), sep="\n")
-    print(f"wrote {given.out / 'reproduction.json'} and the pictures beside it")
+    say(*findings(rows))
+    say(f"wrote {given.out / 'reproduction.json'} and the pictures beside it")
     return 0
 
 

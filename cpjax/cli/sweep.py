@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from cpjax import io
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import (
     CONTROLLER_OPTIONS,
     EVALUATION_OPTIONS,
@@ -17,6 +18,7 @@ from cpjax.cli.options import (
     build_plant,
     resolve,
 )
+from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.sim.metrics import ProtocolMetrics
@@ -52,6 +54,8 @@ def run(given: argparse.Namespace) -> int:
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     controller = build_controller(sections["controller"], plant)
+    notes = notes_on(sections["plant"], plant, {"the controller": controller})
+    announce("sweep", notes)
     setting = {"starts": "hanging", "count": 4096, "duration": 20.0, "dt": 0.002, **sections["evaluation"]}
     chosen = {"precision": "float64", "format": "npz", **sections["sweep"]}
     name, count = setting.pop("starts"), setting.pop("count")
@@ -82,7 +86,7 @@ def run(given: argparse.Namespace) -> int:
     steps = round(setting["duration"] / setting["dt"])
     speed = f"{count * steps / 1e6:.0f} M steps in {seconds:.1f} s, compilation and files included"
     if metrics is None:
-        print(f"{speed}\nwrote {path}")
+        say(speed, f"wrote {path}")
         return 0
 
     from cpjax.show.figures import save_figure
@@ -98,6 +102,7 @@ def run(given: argparse.Namespace) -> int:
         "precision": chosen["precision"],
         "plant": io.encode(plant),
         "controller": io.encode(controller),
+        "notes": notes,
         "file": path.name,
         "seconds": seconds,
         **summary,
@@ -108,7 +113,7 @@ def run(given: argparse.Namespace) -> int:
     rows = [(cost, *(f"{spread[cost][key]:.4g}" for key in ("mean", "median", "max"))) for cost in COSTS]
     print_table("Over the successful runs", ("metric", "mean", "median", "max"), rows, text_columns=1)
     low, high = (100 * bound for bound in summary["success_interval"])
-    print(f"{100 * summary['success_rate']:.2f} % of {count} starts settle ({low:.2f} to {high:.2f} %)")
-    print(speed)
-    print(f"wrote {path}, sweep.json and sweep.png")
+    say(f"{100 * summary['success_rate']:.2f} % of {count} starts settle ({low:.2f} to {high:.2f} %)")
+    say(speed)
+    say(f"wrote {path}, sweep.json and sweep.png")
     return 0

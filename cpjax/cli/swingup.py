@@ -1,6 +1,7 @@
 """`cpjax swingup`: one rollout, as a table, a picture and JSON."""
 
 import argparse
+import math
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cpjax import io
+from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import (
     CONTROLLER_OPTIONS,
     PLANT_OPTIONS,
@@ -19,10 +21,12 @@ from cpjax.cli.options import (
     build_start,
     resolve,
 )
+from cpjax.cli.output import say
+from cpjax.controllers import REGULATE, Hybrid
 from cpjax.errors import InputError
-from cpjax.sim.flags import describe
+from cpjax.sim.flags import STOPPED, Flag, describe
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
-from cpjax.sim.rollout import rollout
+from cpjax.sim.rollout import Trajectory, rollout
 
 OPTIONS = [*START_OPTIONS, *RUN_OPTIONS, *PLANT_OPTIONS, *CONTROLLER_OPTIONS]
 
@@ -50,6 +54,8 @@ def run(given: argparse.Namespace) -> int:
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
     controller = build_controller(sections["controller"], plant)
+    notes = notes_on(sections["plant"], plant, {"the controller": controller})
+    announce("swingup", notes)
     start = build_start(sections["start"], given.seed)
     settings = {"duration": 20.0, "dt": 0.002, "clock": "sampled", **sections["run"]}
     try:
@@ -67,6 +73,7 @@ def run(given: argparse.Namespace) -> int:
         "start": io.encode(start),
         "plant": io.encode(plant),
         "controller": io.encode(controller),
+        "notes": notes,
         "flag": describe(metrics.flag),
         "metrics": {name: getattr(metrics, name) for name in metrics.__dataclass_fields__},
         "trajectory": {
@@ -85,7 +92,9 @@ def run(given: argparse.Namespace) -> int:
     until = min(end, float(metrics.settling_time) + 3.0) if bool(metrics.success) else end  # at rest there is no news
     save_figure(picture, response(trajectory, _title(metrics), until, float(plant.motor.voltage_limit)))
     _print(metrics)
-    print(f"wrote {path} and {picture}")
+    if not bool(metrics.success):
+        say("why: " + reason(trajectory, fold, hybrid=isinstance(controller, Hybrid)))
+    say(f"wrote {path} and {picture}")
     return 0 if bool(metrics.success) else 1
 
 
@@ -107,3 +116,37 @@ def _print(metrics: Metrics) -> None:
         table.add_row(name, "never" if text == "inf" else text, unit)
     table.add_row("flag", describe(int(metrics.flag)), "")
     Console().print(table)
+
+
+def reason(run: Trajectory, fold: ProtocolMetrics, *, hybrid: bool) -> str:
+    """Why a run does not count as settled, as far as it is plain to see."""
+    flag, end = int(run.flag), float(run.time[-1])
+    states = np.asarray(run.state.vector())
+    x, theta = float(states[-1, 0]), float(states[-1, 2])
+    if flag & STOPPED:
+        held = np.all(states == states[-1], axis=1)
+        since = float(run.time[_first_of_the_last(held)])
+        what = "left all bounds" if flag & int(Flag.RUNAWAY) else "could not be computed any further"
+        more = "; an integrator that is unstable for too long a step looks the same: try a smaller dt"
+        return f"the state {what} at {since:.3g} s" + ("" if flag & int(Flag.OVERFLOW) else more)
+    acting = np.asarray(run.mode) == REGULATE
+    entries = int(acting[0]) + int(np.sum(acting[1:] & ~acting[:-1]))
+    if hybrid and not acting.any():
+        return "the pendulum never reached the gate, where the regulator takes over"
+    if hybrid and not acting[-1]:
+        times = "once" if entries == 1 else f"{entries} times"
+        return f"the pendulum reached the gate {times}, and each time left it again"
+    acts = f"the regulator acts since {float(run.time[_first_of_the_last(acting)]):.3g} s, but " if hybrid else ""
+    angle, away = abs(math.remainder(theta, math.tau)), abs(x - float(fold.reference_x))
+    if math.isfinite(float(run.metrics.settling_time)):
+        since = end - float(run.metrics.settling_time)
+        return f"{acts}the run ended {since:.2g} s after it had settled, and {float(fold.hold):g} s are asked for"
+    return (
+        f"{acts}at the end, after {end:g} s, the angle is {angle:.3g} rad and the cart {away:.3g} m away; settled is "
+        f"within {float(fold.angle_band):g} rad and {float(fold.position_band):g} m"
+    )
+
+
+def _first_of_the_last(holds: np.ndarray[Any, Any]) -> int:
+    """Where the stretch begins in which this holds to the end."""
+    return len(holds) - int(np.argmin(np.append(holds[::-1], False)))

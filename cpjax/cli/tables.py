@@ -5,14 +5,16 @@ from collections.abc import Iterable, Sequence
 from rich.console import Console
 from rich.table import Table
 
+from cpjax.errors import printable
+
 
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int) -> None:
-    """A table whose first `text_columns` columns are words and whose others are numbers."""
-    table = Table(title=title, title_justify="left")
+    """Prints a table whose first `text_columns` columns are words and whose others are numbers."""
+    table = Table(title=printable(title), title_justify="left")
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i < text_columns else "right", overflow="fold")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(printable, row))
     # Where the width is not known (a file, a pipe) lines are as long as they need to be.
     width = None if Console().is_terminal else 200
     console = Console(width=width, markup=False)  # [s] is a unit, not a style

@@ -2,14 +2,17 @@
 
 import argparse
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from cpjax import io
-from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, numbers_of, resolve
-from cpjax.cli.progress import progress
+from cpjax.cli.notes import announce, notes_on
+from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, numbers_of, resolve, saved
+from cpjax.cli.output import say
+from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
@@ -89,31 +92,35 @@ def run(given: argparse.Namespace) -> int:
     setting = dict(sections["tune"])
     chosen: dict[str, Any] = {key: setting.pop(key) for key in ("design", "gate") if key in setting}
     controller = _begin(setting.pop("start_from", "bland"), plant, chosen)
+    notes = notes_on(sections["plant"], plant, {"the controller to start from": controller})
+    announce("tune", notes)
     names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}
     free = free_parameters(controller, **names, full_q=setting.pop("full_q", "diagonal") == "full")
     plan = Plan(seed=given.seed, goal=Goal(**sections["goal"]), **setting)
-    tuning = tuned(given.out, plant, free, plan, given.out / "checkpoint.npz")
+    tuning = tuned(given.out, plant, free, plan, given.out / "checkpoint.npz", notes)
     before = np.asarray(free.physical(free.start()))
     rows = [(label, f"{a:.4g}", f"{b:.4g}") for label, a, b in zip(tuning.labels, before, tuning.physical, strict=True)]
     print_table("Parameters, SI units", ("parameter", "start", "tuned"), rows, text_columns=1)
     after = f", after {tuning.settling_time:.3f} s on average" if tuning.success_rate > 0.0 else ""
-    print(
+    say(
         f"{100 * tuning.success_rate:.2f} % of {plan.final} starts settle{after}; {tuning.value_steps / 1e6:.1f} M "
         f"steps of values, {tuning.gradient_steps / 1e6:.2f} M of gradients, {tuning.seconds:.0f} s"
     )
-    print(f"wrote {given.out / 'tuned.json'}, tune.json and tune.png")
+    say(f"wrote {given.out / 'tuned.json'}, tune.json and tune.png")
     return 0 if tuning.success_rate > 0.0 else 1
 
 
-def tuned(out: Path, plant: CartPole, free: FreeParameters, plan: Plan, checkpoint: Path) -> "Tuning":
+def tuned(
+    out: Path, plant: CartPole, free: FreeParameters, plan: Plan, checkpoint: Path, notes: Sequence[str] = ()
+) -> "Tuning":
     """The tuning, with tuned.json, tune.json and tune.png written."""
     from cpjax.tune.outcome import document
     from cpjax.tune.tuner import tune  # optax takes a while; other commands should not wait for it
 
     with progress("tune") as report:
-        tuning = tune(plant, free, plan, progress=report, checkpoint=checkpoint)
+        tuning = tune(plant, free, plan, progress=compiling(report, "loss"), checkpoint=checkpoint)
     io.save(out / "tuned.json", tuning.controller)
-    io.write_json(out / "tune.json", document(tuning, plant, free, plan))
+    io.write_json(out / "tune.json", {**document(tuning, plant, free, plan), "notes": notes})
 
     from cpjax.show.figures import save_figure
     from cpjax.show.tuning import picture
@@ -128,7 +135,7 @@ def _begin(name: str, plant: Any, chosen: dict[str, Any]) -> Hybrid:
         return beginning(name, chosen.pop("design", "lqr"), plant, **chosen)
     for field, value in chosen.items():
         raise InputError(field, value, "absent: the file's controller has one")
-    loaded = io.load(name)
+    loaded = saved(name, "start_from")
     if not isinstance(loaded, Hybrid):
         raise InputError("start_from", name, "a file that holds a Hybrid")
     return loaded

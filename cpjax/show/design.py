@@ -1,6 +1,7 @@
 """The checks of a linear design as a table and a picture."""
 
 import math
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,11 @@ from cpjax.state import NAMES, UNITS, UPRIGHT, State
 from cpjax.study.design_check import DesignCheck
 
 _INK, _CLIP = "#333333", "#CC79A7"
+_SMALLEST, _LARGEST = 1e-9, 1e9
+"""Half widths of the plane that can still be drawn [rad and rad/s]."""
+
+_BEYOND = 1e6
+"""A share of a limit that is as good as any greater one."""
 
 COMPARISON = (
     "regulator",
@@ -46,19 +52,45 @@ def compared(design: str, gains: str, check: DesignCheck) -> list[str]:
     ]
 
 
+_MARGINS = {
+    "gain may fall to": "times",
+    "gain may rise to": "times",
+    "phase margin": "deg",
+    "delay margin": "ms",
+    "disk margin": "of 2",
+}
+
+
+def instability(check: DesignCheck) -> str | None:
+    """Says which pole makes the linear loop unstable, if one does."""
+    if bool(check.margins.stable):
+        return None
+    if not np.all(np.isfinite(check.poles)):
+        return "not stable: a closed loop too fast to be computed; there are no margins and no certified region"
+    worst = complex(check.poles[np.argmax(check.poles.real)])
+    return f"not stable: a closed-loop pole at {_complex(worst)} 1/s; there are no margins and no certified region"
+
+
 def rows(check: DesignCheck, voltage_limit: float) -> list[tuple[str, str, str]]:
     """What was checked, the figure and its unit."""
     m = check.margins
+    if not bool(m.stable):  # the margins of such a loop are NaN
+        margins = [(name, "none", "the linear loop is not stable") for name in _MARGINS]
+    else:
+        values: tuple[Any, ...] = (
+            m.gain_lower,
+            m.gain_upper,
+            math.degrees(float(m.phase)),
+            1000 * float(m.delay),
+            m.disk,
+        )
+        margins = [(name, f"{float(v):.3g}", unit) for (name, unit), v in zip(_MARGINS.items(), values, strict=True)]
     numbers = [
         ("gain K", " ".join(f"{k:.6g}" for k in check.K[0]), "V per unit"),
         ("closed-loop poles", "  ".join(_complex(p) for p in check.poles), "1/s"),
         ("controllability", _structure(check.controllability), ""),
         ("observability from x and theta", _structure(check.observability), ""),
-        ("gain may fall to", f"{float(m.gain_lower):.3g}", "times"),
-        ("gain may rise to", f"{float(m.gain_upper):.3g}", "times"),
-        ("phase margin", f"{math.degrees(float(m.phase)):.3g}", "deg"),
-        ("delay margin", f"{1000 * float(m.delay):.3g}", "ms"),
-        ("disk margin", f"{float(m.disk):.3g}", "of 2"),
+        *margins,
         (f"voltage at the gate, {math.degrees(check.gate_angle):.3g} deg", f"{check.gate_voltage:.4g}", "V"),
         (f"asks for more than {voltage_limit:g} V beyond", f"{math.degrees(check.saturation_angle):.3g}", "deg"),
     ]
@@ -87,29 +119,40 @@ def picture(check: DesignCheck, gate: Gate, voltage_limit: float, title: str) ->
 
 
 def _plane(axes: Axes, check: DesignCheck, gate: Gate, voltage_limit: float) -> None:
-    K, widest = check.K[0], min(1.3 * check.gate_angle, math.pi)
+    K, widest = check.K[0], min(max(1.3 * check.gate_angle, _SMALLEST), math.pi)
     limited = math.isfinite(voltage_limit)
-    tallest = max(1.3 * voltage_limit / abs(K[3]) if K[3] and limited else 0.0, 3.0 * widest)
-    theta, rate = np.meshgrid(np.linspace(-widest, widest, 301), np.linspace(-tallest, tallest, 301))
-    zero = np.zeros_like(theta)
-    x = zero + float(getattr(gate, "reference", UPRIGHT).x)
-    margin = np.asarray(gate.margin(State(x, zero, theta, rate), jnp.full(theta.shape, SWING_UP)))
+    with np.errstate(all="ignore"):  # any number may be extreme; what is clipped below is beyond the picture
+        upright = float(np.float64(1.3 * voltage_limit) / abs(K[3])) if K[3] and limited else 0.0
+        tallest = min(max(upright, 3.0 * widest), _LARGEST)
+        theta, rate = np.meshgrid(np.linspace(-widest, widest, 301), np.linspace(-tallest, tallest, 301))
+        zero = np.zeros_like(theta)
+        x = zero + float(getattr(gate, "reference", UPRIGHT).x)
+        margin = np.asarray(gate.margin(State(x, zero, theta, rate), jnp.full(theta.shape, SWING_UP)))
+        margin = np.clip(np.nan_to_num(margin, nan=-1.0), -_LARGEST, _LARGEST)
+        demand = _share(np.abs(K[2] * theta + K[3] * rate), voltage_limit)
     degrees = np.degrees(theta)
-    axes.contour(degrees, rate, margin, levels=[0.0], colors=GATE_COLOUR)
-    demand = np.abs(K[2] * theta + K[3] * rate)
+    if margin.min() < 0.0 < margin.max():
+        axes.contour(degrees, rate, margin, levels=[0.0], colors=GATE_COLOUR)
     if limited:
-        axes.contourf(degrees, rate, demand, levels=[0.0, voltage_limit], colors=[_CLIP], alpha=0.25)
+        axes.contourf(degrees, rate, demand, levels=[0.0, 1.0], colors=[_CLIP], alpha=0.25)
         axes.fill_between([], [], color=_CLIP, alpha=0.25, label=f"asks for at most {voltage_limit:g} V")
     if check.P is not None and check.level is not None:
         block = check.P[2:, 2:]
-        form = block[0, 0] * theta**2 + 2 * block[0, 1] * theta * rate + block[1, 1] * rate**2
-        axes.contourf(degrees, rate, form, levels=[0.0, check.level], colors=[_INK], alpha=0.7)
+        with np.errstate(all="ignore"):
+            form = block[0, 0] * theta**2 + 2 * block[0, 1] * theta * rate + block[1, 1] * rate**2
+            form = _share(form, check.level)
+        axes.contourf(degrees, rate, form, levels=[0.0, 1.0], colors=[_INK], alpha=0.7)
     axes.plot([], [], color=GATE_COLOUR, label="gate")
     axes.fill_between([], [], color=_INK, alpha=0.7, label="certified level set")
     axes.set_xlabel(r"$\theta$ [deg]")
     axes.set_ylabel(r"$\dot\theta$ [rad/s]")
     axes.set_title("cart at rest in the middle", loc="left")
     axes.legend(loc="upper right", fontsize=8)
+
+
+def _share(values: np.ndarray[Any, Any], whole: float) -> np.ndarray[Any, Any]:
+    """Of a positive whole, up to more than all of it."""
+    return np.clip(np.nan_to_num(values / np.float64(whole), nan=_BEYOND), 0.0, _BEYOND)
 
 
 def _complex(pole: complex) -> str:

@@ -153,17 +153,21 @@ def _rates(axes: Axes, trajectory: Trajectory) -> None:
     _finish(axes)
 
 
+_DRAWABLE = 1e100
+"""The largest number [V] that an axis can hold; matplotlib multiplies them."""
+
+
 def _voltage(axes: Axes, trajectory: Trajectory, limit: float) -> None:
     _shade_regulation(axes, trajectory)
     axes.step(
         np.asarray(trajectory.time),
-        np.asarray(trajectory.voltage),
+        np.clip(np.asarray(trajectory.voltage), -_DRAWABLE, _DRAWABLE),
         where="post",
         color=_VOLTAGE,
         linewidth=1.0,
         label="u [V], applied",
     )
-    if np.isfinite(limit):
+    if limit <= _DRAWABLE:
         for sign in (-1, 1):
             axes.axhline(sign * limit, color="0.4", linewidth=0.8, linestyle="--")
     axes.set_ylabel("voltage [V]")

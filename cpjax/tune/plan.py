@@ -95,7 +95,7 @@ class Plan:
         if not isinstance(self.aggregate, str) or self.aggregate not in _AGGREGATES:
             raise InputError("aggregate", self.aggregate, "one of " + ", ".join(_AGGREGATES))
         if not isinstance(self.goal, Goal):
-            raise InputError("goal", self.goal, "a cpjax.tune Goal")
+            raise InputError("goal", self.goal, "a cpjax.tune.objective.Goal")
         steps = (("duration", "dt"), ("horizon", "horizon_dt"), ("final_horizon", "final_dt"))
         check_plan(self, _COUNTS, _NUMBERS, steps)
         if self.restarts > self.candidates + 1:

@@ -1,0 +1,124 @@
+"""What a person should know about what was given, and may not see: one line each, on standard error and in the JSON."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cpjax import io, paper
+from cpjax.cli.output import complain
+from cpjax.controllers import StateFeedback
+from cpjax.plant import CartPole, Motor
+from cpjax.presets import differences, model_differences
+from cpjax.pytree import Number, rules
+
+_MOTOR = {key: rule for key, rule in rules(Motor).items() if isinstance(rule, Number)}
+_SUPPLY = "voltage_limit"
+"""Of the motor's fields the one that is no property of the motor; no linear model knows it."""
+
+
+def announce(command: str, notes: Sequence[str]) -> None:
+    """Prints the notes."""
+    for note in notes:
+        complain(f"cpjax {command}: note: {note}")
+
+
+def notes_on(given: Mapping[str, Any], plant: CartPole, controllers: Mapping[str, Any] | None = None) -> list[str]:
+    """All notes on a plant that was built from the options `given`, and on controllers, by their names, that run it."""
+    found = plant_notes(given, plant)
+    for name, controller in (controllers or {}).items():
+        found += controller_notes(name, controller, plant)
+    return found
+
+
+def plant_notes(given: Mapping[str, Any], plant: CartPole) -> list[str]:
+    """Which fields of a motor that was given in part have values that nobody gave."""
+    base = given.get("base", "appendix")
+    stated = {key for key in _MOTOR if key in given}
+    whose = f"the {base} plant's"
+    if base not in paper.PLANTS:
+        table = io.read_table(Path(base))
+        table = table.get("plant", table) if "type" not in table else table
+        motor = table.get("motor", {})
+        stated |= set(motor) & set(_MOTOR)
+        whose = "the paper's"
+        if not stated:
+            stated = {""}  # of a plant that leaves out its motor, all of it is worth a line
+    left = [key for key in _MOTOR if key not in stated]
+    if not stated - {_SUPPLY} or not set(left) - {_SUPPLY}:
+        return []
+    values = ", ".join(f"{key} = {float(getattr(plant.motor, key)):g} {_MOTOR[key].unit}" for key in left)
+    mass, damping = float(plant.motor.reflected_mass), float(plant.motor.damping)
+    return [
+        f"the motor was given in part; left at {whose} values: {values}. Behind its gear and wheel the rotor weighs "
+        f"{mass:.3g} kg at the cart, and the motor damps the cart with {damping:.3g} N s/m"
+    ]
+
+
+def controller_notes(name: str, controller: Any, plant: CartPole) -> list[str]:
+    """That a controller was made for another plant, or that its regulator does not hold this one."""
+    found = []
+    others = model_differences(controller, plant)
+    if others:
+        more = f", and {len(others) - 3} more" if len(others) > 3 else ""
+        found.append(f"{name} was made for another plant: its model differs in {', '.join(others[:3])}{more}")
+    regulator = getattr(controller, "regulator", None) or getattr(controller, "law", None)
+    if isinstance(regulator, StateFeedback) and np.shape(regulator.K) == (1, 4):
+        printed = [design for design, K in paper.PRINTED_GAINS.items() if np.allclose(regulator.K, [K], rtol=1e-6)]
+        if printed and papers_own(plant) is None:
+            found.append(
+                f"{name} has the gain that the paper prints for its own plant ({printed[0]}), which this is not"
+            )
+        pole = unstable_pole(plant, regulator)
+        if pole is not None:
+            found.append(f"{name} has an unstable regulator: upright it has a closed-loop pole at {shown_pole(pole)}")
+    return found
+
+
+def papers_own(plant: CartPole) -> str | None:
+    """Which of the paper's plants this is, whatever its supply; None if it is another."""
+    for name, make in paper.PLANTS.items():
+        if set(differences(make(), plant)) <= {_SUPPLY}:
+            return name
+    return None
+
+
+def unstable_pole(plant: CartPole, regulator: StateFeedback) -> complex | None:
+    """The pole of the linear closed loop, upright, that grows fastest [1/s]; None if none does.
+
+    Without JAX, whose compilations would take a second.
+    """
+    A, B = np.zeros((4, 4)), np.zeros((4, 1))
+    A[0, 1] = A[2, 3] = 1.0
+
+    motor: Any = plant.motor
+    body: Any = plant  # with complex numbers, which the annotations do not know
+
+    def slope(sin: Any = 0.0, x_dot: Any = 0.0, theta_dot: Any = 0.0, voltage: Any = 0.0) -> tuple[float, float]:
+        """Accelerations per so much of one of these: by a step in the imaginary direction, which rounds nothing off."""
+        force = motor.force(voltage, x_dot)
+        x_ddot, theta_ddot = body.acceleration(sin, 1.0, (x_dot, theta_dot), force)
+        return float(np.imag(x_ddot)) / _STEP, float(np.imag(theta_ddot)) / _STEP
+
+    step: Any = complex(0.0, _STEP)
+    with np.errstate(all="ignore"):
+        try:
+            A[[1, 3], 1], A[[1, 3], 2] = slope(x_dot=step), slope(sin=step)
+            A[[1, 3], 3], B[[1, 3], 0] = slope(theta_dot=step), slope(voltage=step)
+            loop = A - B @ np.asarray(regulator.K, dtype=float)
+            poles = np.linalg.eigvals(loop)
+        except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError):  # batches and overflows: others' matter
+            return None
+    worst = complex(poles[np.argmax(poles.real)])
+    # A pole at zero, of a cart that nothing centres, comes out as rounding noise of the matrix.
+    return worst if worst.real > 1e-9 * max(1.0, float(np.max(np.abs(loop)))) and math.isfinite(worst.real) else None
+
+
+_STEP = 1e-20
+
+
+def shown_pole(pole: complex) -> str:
+    """A pole for people."""
+    return f"{pole.real:.3g}{pole.imag:+.3g}i 1/s" if pole.imag else f"{pole.real:.3g} 1/s"
