@@ -132,7 +132,7 @@ def update_controller(plant: Plant, controller: Any, memory: Any, state: Tree, s
         mode = integer("controller.next_mode", call("controller", controller, "next_mode", state, memory.mode))
         return ModeMemory(mode), Input(applied_voltage(plant, controller, state, mode))
     if settings.derivative != "mean":
-        updated, command = part_of_step(_updated)(as_sampled(controller), memory, state)
+        updated, command = _updated(as_sampled(controller), memory, state)
         return updated, Input(plants.saturate(plant, command))
     updated, command = part_of_step(_updated)(as_sampled(tracked(controller)), memory, state)
     unchanged, held = part_of_step(_updated)(as_sampled(holding(controller)), memory, state)
