@@ -326,6 +326,8 @@ def _is_leaf(value: Any) -> bool:
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
     """Whether a shape is the expected one, in which None stands for any length."""
+    if shape == expected:
+        return True
     return len(shape) == len(expected) and all(
         wanted in (None, length) for length, wanted in zip(shape, expected, strict=True)
     )
@@ -341,28 +343,28 @@ class Hidden:
 jax.tree_util.register_pytree_node(Hidden, lambda node: ((), node.value), lambda value, _: Hidden(value))
 
 
-def hide(name: str, tree: T) -> T:
-    """Returns the tree with every leaf that is no number hidden from JAX, so that the tree can be traced.
+def as_arguments(name: str, tree: T, dtype: Any) -> T:
+    """Returns the tree as JAX can trace it: numbers cast to `dtype` (see `cast`), other leaves hidden.
 
     Raises:
-      InputError: such a leaf cannot be hashed.
+      InputError: a leaf that is no number cannot be hashed.
     """
-    leaves, structure = jax.tree.flatten(tree)
-    if all(_is_number(leaf) for leaf in leaves):
-        return tree
-    for i, leaf in enumerate(leaves):
-        if not _is_number(leaf):
-            try:
-                hash(leaf)
-            except TypeError as problem:
-                raise InputError(name, leaf, "a component whose choices can be hashed") from problem
-            leaves[i] = Hidden(leaf)
-    hidden: T = jax.tree.unflatten(structure, leaves)
-    return hidden
+
+    def convert(leaf: Any) -> Any:
+        if _is_number(leaf):
+            return _cast(leaf, dtype)
+        try:
+            hash(leaf)
+        except TypeError as problem:
+            raise InputError(name, leaf, "a component whose choices can be hashed") from problem
+        return Hidden(leaf)
+
+    converted: T = jax.tree.map(convert, tree)
+    return converted
 
 
 def reveal(tree: T) -> T:
-    """Undoes `hide`."""
+    """Returns the tree with what `as_arguments` has hidden."""
 
     def is_hidden(node: Any) -> bool:
         return isinstance(node, Hidden)
@@ -372,18 +374,17 @@ def reveal(tree: T) -> T:
 
 
 def cast(tree: T, dtype: Any) -> T:
-    """`tree` with every real leaf as an array of `dtype`; integers and booleans stay what they are.
+    """Returns the tree with every real leaf as an array of `dtype`; integers and booleans stay what they are.
 
     Traced leaves are converted too, with their derivatives.
     """
+    converted: T = jax.tree.map(lambda leaf: _cast(leaf, dtype), tree)
+    return converted
 
-    def convert(leaf: Any) -> Any:
-        real = isinstance(leaf, float) or jnp.issubdtype(getattr(leaf, "dtype", int), jnp.floating)
-        if not real:
-            return leaf
-        return as_array(leaf, dtype)
 
-    return jax.tree.map(convert, tree)
+def _cast(leaf: Any, dtype: Any) -> Any:
+    real = isinstance(leaf, float) or jnp.issubdtype(getattr(leaf, "dtype", int), jnp.floating)
+    return as_array(leaf, dtype) if real else leaf
 
 
 def as_array(value: Any, dtype: Any) -> Array:

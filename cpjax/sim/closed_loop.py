@@ -13,7 +13,7 @@ from cpjax.compilation import part_of_step
 from cpjax.controllers.protocol import SmoothController, demand
 from cpjax.returned import call, integer, real
 from cpjax.sim import plants
-from cpjax.sim.plants import Eventful, Plant, Tree
+from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.stepper import dtype_of
 from cpjax.sim.switching import Guards, Observation
 
@@ -69,7 +69,7 @@ class ContinuousLoop(NamedTuple):
         inside = jnp.where(now == -mode.clip, now, 0)
         clip = jnp.where(mode.clip == 0, jnp.where(guard == UPPER, 1, -1), inside)
         clip = jnp.where(guard == GATE, now, clip).astype(mode.clip.dtype)
-        if not isinstance(self.plant, Eventful):
+        if not plants.has_events(self.plant):
             return q, v, Mode(law, clip, mode.plant)
         own = guard > GATE
         after_q, after_v, after = plant_jump(self.plant, q, v, mode.plant, guard - (GATE + 1))
@@ -132,7 +132,7 @@ def plant_accelerations(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree
 
 def plant_guards(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Guards:
     """Returns the plant's own guards, if it has any."""
-    if not isinstance(plant, Eventful):
+    if not plants.has_events(plant):
         return ()
     guards = call("plant", plant, "guards", q, v, u, mode)
     return tuple(real(f"plant.guards[{i}]", guard, u.dtype) for i, guard in enumerate(guards))

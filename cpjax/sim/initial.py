@@ -1,5 +1,6 @@
 """Checks of the initial state that a rollout is given."""
 
+import functools
 from typing import Any
 
 import jax
@@ -41,13 +42,12 @@ def checked_tree(
         leaves = structure.flatten_up_to(start)
     except (ValueError, TypeError) as problem:
         kind = type(limits)
-        components = ", ".join(_name(path) for path, _ in jax.tree_util.tree_leaves_with_path(limits))
+        components = ", ".join(component_names(structure))
         where = "cpjax." if kind.__module__.startswith("cpjax.") else ""
         raise InputError(field, start, f"a {where}{kind.__name__}({components})") from problem
-    pairs = jax.tree_util.tree_leaves_with_path(limits)
-    names = [_name(path) for path, _ in pairs]
+    names = component_names(structure)
     dtypes = {}
-    for name, value, (_, limit) in zip(names, leaves, pairs, strict=True):
+    for name, value, limit in zip(names, leaves, jax.tree.leaves(limits), strict=True):
         path = f"{field}.{name}"
         within = f"finite, and within {limit:g} {units.get(name, '')}".rstrip()
         if isinstance(value, bool) or not (isinstance(value, (int, float)) or hasattr(value, "dtype")):
@@ -85,5 +85,8 @@ def checked_tree(
     return jax.tree.unflatten(structure, values), dtype, count
 
 
-def _name(path: Any) -> str:
-    return jax.tree_util.keystr(path, simple=True, separator=".")
+@functools.cache
+def component_names(structure: Any) -> tuple[str, ...]:
+    """Returns the names of the components of a state of this structure, in order."""
+    paths = jax.tree_util.tree_leaves_with_path(jax.tree.unflatten(structure, range(structure.num_leaves)))
+    return tuple(jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths)

@@ -15,14 +15,14 @@ from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.protocol import Controller, Law, ModalController, SmoothController, as_controller, at_period
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
-from cpjax.pytree import cast, check, hide, pytree, reveal
+from cpjax.pytree import as_arguments, check, pytree, reveal
 from cpjax.sim import located, per_step
 from cpjax.sim.derivatives import may_switch, watched
 from cpjax.sim.flags import IN_DOUBT
 from cpjax.sim.initial import checked_initial
 from cpjax.sim.kept import Kept, fields, keep
 from cpjax.sim.metrics import Fold, NoMetrics, ProtocolMetrics, Sample
-from cpjax.sim.plants import Eventful, Plant, Tree, check_plant
+from cpjax.sim.plants import Plant, Tree, check_plant, has_events
 from cpjax.sim.settings import Settings, Simulation, check_names, check_settings
 
 
@@ -121,7 +121,7 @@ def prepared(
       InputError: as `rollout` does.
     """
     check_plant(plant)
-    settings = check_settings(**simulation, events=isinstance(plant, Eventful))
+    settings = check_settings(**simulation, events=has_events(plant))
     name = "starts" if batched else "start"
     start, dtype, count = checked_initial(plant, start, name, batched=batched)
     controller = _without_designs(as_controller(controller))
@@ -142,7 +142,7 @@ def prepared(
         raise InputError("metrics", metrics, "a metric with init, update and finish, such as cpjax.ProtocolMetrics()")
     parts: tuple[tuple[str, Any], ...] = (("plant", plant), ("controller", controller), ("metrics", metrics))
     each = [leaf for name, part in parts for leaf in check(name, part, count)]
-    plant, controller, metrics = (hide(name, cast(part, dtype)) for name, part in parts)
+    plant, controller, metrics = (as_arguments(name, part, dtype) for name, part in parts)
     dt = np.asarray(simulation["dt"], dtype=dtype)
     return start, (plant, controller, metrics, dt), settings, [*each, False]
 

@@ -22,6 +22,7 @@ from cpjax.controllers.protocol import Controller, Law, ModalController
 from cpjax.errors import InputError
 from cpjax.pytree import is_traced
 from cpjax.sim.flags import IN_DOUBT
+from cpjax.sim.initial import component_names
 from cpjax.sim.kept import Kept
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.plants import Plant, Tree
@@ -124,11 +125,10 @@ class Work(NamedTuple):
     """Starts of a block; the last one is filled up with copies of the last start."""
 
     @property
-    def names(self) -> list[str]:
+    def names(self) -> tuple[str, ...]:
         """Names of the initial state's components, whose leaves come first."""
         starts, _ = jax.tree.unflatten(self.kind.structure, self.leaves)
-        paths = jax.tree_util.tree_leaves_with_path(starts)
-        return [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths]
+        return component_names(jax.tree.structure(starts))
 
     @property
     def traced(self) -> bool:
