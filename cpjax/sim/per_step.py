@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Literal
 
 from cpjax import runtime
 from cpjax.compilation import one_function, part_of_step
@@ -134,8 +135,8 @@ def update_controller(plant: Plant, controller: Any, memory: Any, state: Tree, s
     if settings.derivative != "mean":
         updated, command = _updated(as_sampled(controller), memory, state)
         return updated, Input(plants.saturate(plant, command))
-    updated, command = part_of_step(_updated)(as_sampled(tracked(controller)), memory, state)
-    unchanged, held = part_of_step(_updated)(as_sampled(holding(controller)), memory, state)
+    updated, command = _updated(as_sampled(tracked(controller)), memory, state)
+    unchanged, held = _updated(as_sampled(holding(controller)), memory, state)
     shift = shift_of(updated).astype(command.dtype)
     given = Input(plants.saturate(plant, command), plants.saturate(plant, held), shift)
     return blend_memory(updated, unchanged, shift), given
@@ -163,6 +164,8 @@ def _fold(
     new = like("metrics.update", update(fold, memory, sample), memory)
     if now.held is None or now.shift is None or before.held is None:
         return new
+    if not _sees_the_voltage(fold, memory, sample):
+        return new
     # A metric need not be linear in the voltage. So it is computed with the other voltage too: with that of the period
     # before, which is still applied unless this is a control instant, and with that of the period that begins.
     instant = index % settings.steps_per_control == 0
@@ -170,6 +173,21 @@ def _fold(
     result = shifted(new, update(fold, memory, _completed(plant, since)), before.shift)
     begun = sample._replace(voltage=now.held)
     return shifted(result, update(fold, memory, _completed(plant, begun)), jnp.where(instant, now.shift, 0.0))
+
+
+def _sees_the_voltage(fold: Fold, memory: Any, sample: Sample) -> bool:
+    """Whether a metric's update may depend on the voltage, or on what the plant keeps because of it."""
+
+    def update(voltages: Any) -> Any:
+        voltage, since, outputs = voltages
+        return update_metric(fold, memory, sample._replace(voltage=voltage, voltage_since=since, outputs=outputs))
+
+    jaxpr = jax.make_jaxpr(update)((sample.voltage, sample.voltage_since, sample.outputs)).jaxpr
+    reached = set(jaxpr.invars)
+    for equation in jaxpr.eqns:
+        if any(not isinstance(v, Literal) and v in reached for v in equation.invars):
+            reached.update(equation.outvars)
+    return any(not isinstance(v, Literal) and v in reached for v in jaxpr.outvars)
 
 
 def _completed(plant: Plant, sample: Sample) -> Sample:
