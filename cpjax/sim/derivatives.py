@@ -12,6 +12,10 @@ This is smoothed perturbation analysis (Gong and Ho, 1987) of the hybrid loop. T
 through the margins at the two control instants about it vanishes, so both values and derivatives are those at the
 crossing, to first order in T.
 
+A command that is held over a period acts in its middle on average, half a period after the change of mode that it
+stands for. So 3/2 of the difference is put into the period of the change, and -1/2 into the next, whose mean is the
+instant of the change. That makes the error of the mean one of second order in T.
+
 Whatever sits in the loop, estimator, delay or memory, the command that the old mode would have led to is found by
 running the controller a second time with its mode held. The parts that have a mode are found inside any controller and
 replaced, by one that also tracks its margin (`Tracked`) and one that holds its mode (`Holding`).
@@ -124,19 +128,19 @@ def _shifted_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return new, jax.tree.map(moved, new, old, d_new)
 
 
-def blend_memory(new: Any, old: Any, shift: jax.Array) -> Any:
-    """Returns a controller's new memory with the share `shift` of what the old mode would have made of it.
+def difference(held: Any, updated: Any) -> Any:
+    """Returns by how much a controller's memory would differ, had its mode been held: of the float leaves.
 
-    Modes and their margins are left as they are: those belong to the mode that was chosen.
+    None stands for other leaves, and for modes and their margins, which belong to the mode that was chosen.
     """
 
     def is_mode(node: Any) -> bool:
         return isinstance(node, ModeMemory)
 
-    new_parts, structure = jax.tree.flatten(new, is_leaf=is_mode)
-    old_parts = jax.tree.leaves(old, is_leaf=is_mode)
-    parts = [a if is_mode(a) else shifted(a, b, shift) for a, b in zip(new_parts, old_parts, strict=True)]
-    return jax.tree.unflatten(structure, parts)
+    def less(a: Any, b: Any) -> Any:
+        return None if is_mode(a) or not jnp.issubdtype(jnp.asarray(a).dtype, jnp.floating) else a - b
+
+    return jax.tree.map(less, held, updated, is_leaf=is_mode)
 
 
 def may_switch(controller: Any) -> bool:

@@ -14,14 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from cpjax.compilation import one_function, part_of_step
+from cpjax.errors import InputError
 from cpjax.returned import call, like
 from cpjax.sim import failures, plants
 from cpjax.sim.closed_loop import ContinuousLoop, HeldLoop, HeldMode, System
+from cpjax.sim.control import Control, start_control, update_control
 from cpjax.sim.flags import CHATTER_LENGTH, Flag, unknown
 from cpjax.sim.integrators import INTEGRATORS, Integrator
 from cpjax.sim.kept import pack
 from cpjax.sim.metrics import Fold, Sample
-from cpjax.sim.per_step import mode_of, start_controller, update_controller, update_metric
+from cpjax.sim.per_step import sees_the_voltage, update_metric
 from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
@@ -37,8 +39,8 @@ class _Loop(NamedTuple):
     """At the sample before [V]."""
     mode: jax.Array
     """At the sample before."""
-    memory: Any
-    """The controller's, on the sampled clock; else ()."""
+    control: Control | None
+    """On the sampled clock."""
     changes: jax.Array
     """Control instants in a row at which the mode changed, on the sampled clock."""
 
@@ -51,21 +53,25 @@ def simulate(
     flag = unknown((start, plant, controller))
     system: System
     mode: Any
-    memory: Any
+    control = None
     if settings.clock == "continuous":
         system = ContinuousLoop(plant, controller)
-        mode, memory = system.start_mode(start), ()
+        mode = system.start_mode(start)
     else:
         system = HeldLoop(plant)
-        memory, _ = start_controller(plant, controller, start, settings)
-        memory, given = update_controller(plant, controller, memory, start, settings)
-        mode = HeldMode(given.applied, plants.start_mode(plant, q, v))
+        control = start_control(plant, controller, start, settings)
+        control = update_control(plant, controller, control, start, settings)
+        mode = HeldMode(control.applied, plants.start_mode(plant, q, v))
     motion = start_motion(system, q, v, mode, dt)
-    loop = _Loop(motion, flag, motion.seen.output, _law(motion, memory), memory, jnp.zeros_like(flag))
+    loop = _Loop(motion, flag, motion.seen.output, _law(motion, control), control, jnp.zeros_like(flag))
     first = _sample(plant, loop, motion, dt)
+    started = call("metrics", fold, "init", first)
+    if settings.derivative == "mean" and sees_the_voltage(fold, started, first):
+        allowed = "pathwise, for a plant with events and a metric that depends on the voltage"
+        raise InputError("derivative", "mean", allowed)
 
     run = one_function(functools.partial(_run, settings=settings), stacks=True)
-    carry = (loop, fold.update(call("metrics", fold, "init", first), first))
+    carry = (loop, fold.update(started, first))
     carry, kept = run(carry, plant, controller, fold, dt)
     loop, memory = carry
     last = _sample(plant, loop, loop.motion, dt)
@@ -102,9 +108,10 @@ def _run(
     return scan(body, carry, jnp.arange(iterations, dtype=jnp.int32), settings.checkpoint)
 
 
-def _law(motion: Motion, memory: Any) -> jax.Array:
+def _law(motion: Motion, control: Control | None) -> jax.Array:
     """Returns the controller's mode."""
-    return mode_of(memory) if isinstance(motion.mode, HeldMode) else motion.mode.law
+    law: jax.Array = motion.mode.law if control is None else control.mode
+    return law
 
 
 def _sample(plant: Plant, loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
@@ -120,7 +127,7 @@ def _sample(plant: Plant, loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
         voltage=motion.seen.output,
         voltage_since=loop.voltage,
         voltage_until=None if held else jnp.where(landed, before.seen.output, motion.seen.output),
-        mode=_law(motion, loop.memory),
+        mode=_law(motion, loop.control),
         mode_before=loop.mode,
         outputs=plants.outputs(plant, state, motion.seen.acceleration, motion.seen.output),
         plant_mode=motion.mode.plant,
@@ -168,14 +175,16 @@ def _control(
     plant: Plant, controller: Any, system: System, loop: _Loop, instant: jax.Array, settings: Settings
 ) -> _Loop:
     """Reads the controller on the sampled clock, if this is a control instant."""
-    motion, mode = loop.motion, loop.motion.mode
+    motion = loop.motion
+    assert loop.control is not None
     state = plants.state_of(plant, motion.q, motion.v)
-    memory, given = update_controller(plant, controller, loop.memory, state, settings)
-    changes = jnp.where(mode_of(memory) != mode_of(loop.memory), loop.changes + 1, 0)
-    mode = mode._replace(u=given.applied)
+    control = update_control(plant, controller, loop.control, state, settings)
+    changes = jnp.where(control.mode != loop.control.mode, loop.changes + 1, 0)
+    mode = motion.mode._replace(u=control.applied)
     seen, slopes = observe(system, motion.q, motion.v, mode)
-    new = (memory, changes, motion._replace(mode=mode, seen=seen, slopes=slopes))
-    old = (loop.memory, loop.changes, motion)
-    memory, changes, motion = jax.tree.map(lambda x, y: jnp.where(instant, x, y), new, old)
+    new = (control, changes, motion._replace(mode=mode, seen=seen, slopes=slopes))
+    control, changes, motion = jax.tree.map(
+        lambda x, y: jnp.where(instant, x, y), new, (loop.control, loop.changes, motion)
+    )
     chatter = jnp.where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
-    return loop._replace(motion=motion, memory=memory, changes=changes, flag=loop.flag | chatter)
+    return loop._replace(motion=motion, control=control, changes=changes, flag=loop.flag | chatter)

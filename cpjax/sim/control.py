@@ -1,0 +1,108 @@
+"""The controller in the loop: its memory, and the input that the drive makes of its command."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.controllers.protocol import ModeMemory, as_sampled, modes_in, start_memory
+from cpjax.pytree import cast
+from cpjax.returned import call, integer, like, pair, real
+from cpjax.sim import plants
+from cpjax.sim.derivatives import difference, holding, shift_of, shifted, tracked
+from cpjax.sim.plants import Plant, Tree
+from cpjax.sim.settings import Settings
+from cpjax.sim.stepper import applied_voltage, dtype_of
+
+
+class Blend(NamedTuple):
+    """What the derivative of the mean needs of a control period; see `derivatives.py`."""
+
+    held: jax.Array
+    """The voltage that would be applied, had the controller's mode not changed."""
+    shift: jax.Array
+    """By how much of the period that change of mode moves: value 0, with a derivative."""
+    voltage_echo: jax.Array
+    """What the change of mode in the period before adds to the voltage: value 0."""
+    memory_echo: Any
+    """What this period's change of mode will add to the memory in the next: zeros, of the memory's float leaves."""
+
+
+class Control(NamedTuple):
+    """The controller from a control instant on."""
+
+    memory: Any
+    voltage: jax.Array
+    """What the drive applies."""
+    blend: Blend | None = None
+    """None unless the derivative of the mean is asked for."""
+
+    @property
+    def applied(self) -> jax.Array:
+        """The voltage, with the derivative that the plant is to see."""
+        if self.blend is None:
+            return self.voltage
+        return shifted(self.voltage, self.blend.held, 1.5 * self.blend.shift) + self.blend.voltage_echo
+
+    @property
+    def mode(self) -> jax.Array:
+        """The mode that a trajectory records: of the outermost part of the memory that has one, else 0."""
+        modes = modes_in(self.memory)
+        return modes[0].mode if modes else jnp.asarray(0, dtype=jnp.int32)
+
+
+def start_control(plant: Plant, controller: Any, start: Tree, settings: Settings) -> Control:
+    """Returns the memory before the controller's first update, and the voltage after it."""
+    if settings.clock == "continuous":
+        memory: Any = start_memory(controller, start)
+    else:
+        firmware = as_sampled(tracked(controller) if settings.derivative == "mean" else controller)
+        memory = cast(call("controller", firmware, "init", start), dtype_of(start))
+        memory = jax.tree.map(jnp.asarray, memory)
+    first = update_control(plant, controller, Control(memory, jnp.zeros((), dtype_of(start))), start, settings)
+    if first.blend is None:
+        return Control(memory, first.voltage)
+    nothing = jax.tree.map(jnp.zeros_like, first.blend)
+    return Control(memory, first.voltage, nothing._replace(held=first.voltage))
+
+
+def update_control(plant: Plant, controller: Any, before: Control, state: Tree, settings: Settings) -> Control:
+    """Runs the controller at a control instant."""
+    memory = before.memory
+    if settings.clock == "continuous":
+        mode = integer("controller.next_mode", call("controller", controller, "next_mode", state, memory.mode))
+        return Control(ModeMemory(mode), applied_voltage(plant, controller, state, mode))
+    if settings.derivative != "mean":
+        memory, command = _updated(as_sampled(controller), memory, state)
+        return Control(memory, plants.saturate(plant, command))
+    updated, command = _updated(as_sampled(tracked(controller)), memory, state)
+    unchanged, other = _updated(as_sampled(holding(controller)), memory, state)
+    voltage, held = plants.saturate(plant, command), plants.saturate(plant, other)
+    shift = shift_of(updated).astype(voltage.dtype)
+    nothing = jnp.zeros_like(voltage)
+    echo = nothing
+    if before.blend is not None:
+        updated = _with_echo(updated, before.blend.memory_echo)
+        echo = shifted(nothing, before.blend.held - before.voltage, -0.5 * before.blend.shift)
+    gap = difference(unchanged, updated)
+    memory = _with_echo(updated, shifted(jax.tree.map(jnp.zeros_like, gap), gap, 1.5 * shift))
+    memory_echo = shifted(jax.tree.map(jnp.zeros_like, gap), gap, -0.5 * shift)
+    return Control(memory, voltage, Blend(held, shift, echo, memory_echo))
+
+
+def _updated(controller: Any, memory: Any, state: Tree) -> tuple[Any, jax.Array]:
+    returned = call("controller", controller, "update", memory, state)
+    updated, command = pair("controller.update", returned, "the new memory and the command")
+    dtype = dtype_of(state)
+    return like("controller.update: memory", cast(updated, dtype), memory), real("controller.update", command, dtype)
+
+
+def _with_echo(memory: Any, echo: Any) -> Any:
+    """Returns a memory with the zeros of `difference` added, for their derivative."""
+    leaves, structure = jax.tree.flatten(memory, is_leaf=_is_mode)
+    zeros = jax.tree.leaves(echo, is_leaf=lambda node: node is None)
+    return jax.tree.unflatten(structure, [a if b is None else a + b for a, b in zip(leaves, zeros, strict=True)])
+
+
+def _is_mode(node: Any) -> bool:
+    return isinstance(node, ModeMemory)
