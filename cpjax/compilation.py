@@ -10,6 +10,7 @@ for versions of jaxlib that they were tested with, and only around operations th
 out calls into other libraries (a solver, a callback). Only speed depends on them, and the last bits of results.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +21,7 @@ from jaxlib.mlir import ir
 from jaxlib.mlir.dialects import func
 
 from cpjax import runtime
+from cpjax.pytree import hide, reveal
 
 LARGEST = 1 << 14
 """Above so many numbers in a result, each operation of a loop is shared out to the cores, which is JAX's own way."""
@@ -78,13 +80,23 @@ class _Marks:
 
 
 def _called(function: Callable[..., Any], marks: _Marks, stacks: bool) -> Callable[..., Any]:
-    jitted = jax.jit(function)
+    jitted = jax.jit(_revealed(function))
 
     def called(*args: Any) -> Any:
-        results = jitted(*_bind(marks.arguments, args))
+        results = jitted(*_bind(marks.arguments, hide(args)))
         return (_bind(marks.results, results[0]), results[1]) if stacks else _bind(marks.results, results)
 
     return called
+
+
+@functools.lru_cache(maxsize=256)
+def _revealed(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, of arguments that `hide` has been applied to. The same one each time, so that JAX traces it once."""
+
+    def revealed(*args: Any) -> Any:
+        return function(*reveal(args))
+
+    return functools.update_wrapper(revealed, getattr(function, "func", function))
 
 
 def _bind(primitive: Any, tree: Any) -> Any:

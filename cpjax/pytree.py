@@ -255,7 +255,7 @@ def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
       batch: how many components the tree may hold: declared fields may have a leading axis of this length.
 
     Returns:
-      For each leaf whether it has that axis.
+      For each number among the leaves whether it has that axis.
 
     Raises:
       InputError: a leaf that is neither a number nor a choice (a function, a text), a number or matrix with another
@@ -268,9 +268,9 @@ def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
         where = f"{name}{jax.tree_util.keystr(path)}"
         if is_component(node):
             batched += _check_fields(where, node, batch)
-        elif _is_number(node) or (path and _is_choice(node)):
+        elif is_number(node):
             batched.append(False)
-        else:
+        elif not (path and _is_choice(node)):
             allowed = (
                 "a number; a class of your own is made a component by the decorator cpjax.pytree.pytree, or by "
                 "registering it with JAX as a pytree"
@@ -288,7 +288,8 @@ _COMPONENTS: dict[type, tuple[str, ...]] = {}
 """Classes made by `pytree`, and their fields that hold one number each without declaring more."""
 
 
-def _is_number(leaf: Any) -> bool:
+def is_number(leaf: Any) -> bool:
+    """Whether a leaf of a tree is a number, or an array of them."""
     return isinstance(leaf, (int, float)) or hasattr(leaf, "dtype")
 
 
@@ -303,7 +304,7 @@ def _check_fields(name: str, tree: Any, batch: int | None) -> list[bool]:
         path, value, rule = f"{name}.{field.name}", getattr(tree, field.name), declared.get(field.name)
         if is_component(value):
             batched += _check_fields(path, value, batch)
-        elif isinstance(rule, (Number, Matrix)) or (field.name in scalars and _is_number(value)):
+        elif isinstance(rule, (Number, Matrix)) or (field.name in scalars and is_number(value)):
             expected = rule.shape if isinstance(rule, Matrix) else ()
             shape = () if isinstance(value, float) else np.shape(value)
             fits = _fits(shape, expected)
@@ -315,8 +316,8 @@ def _check_fields(name: str, tree: Any, batch: int | None) -> list[bool]:
                 raise InputError(path, f"array of shape {shape}", f"of shape {expected}; {more}")
             if rule is not None:
                 rule.normalise(path, value)
-        elif value is not None:
-            batched += [False] if _is_choice(value) and _is_leaf(value) else check(path, value, batch)
+        elif value is not None and not (_is_choice(value) and _is_leaf(value)):
+            batched += check(path, value, batch)
     return batched
 
 
@@ -343,6 +344,15 @@ class Hidden:
 jax.tree_util.register_pytree_node(Hidden, lambda node: ((), node.value), lambda value, _: Hidden(value))
 
 
+def hide(tree: T) -> T:
+    """Returns the tree with leaves that are no numbers hidden from JAX."""
+    leaves, structure = jax.tree.flatten(tree)
+    if all(is_number(leaf) for leaf in leaves):
+        return tree
+    hidden: T = jax.tree.unflatten(structure, [leaf if is_number(leaf) else Hidden(leaf) for leaf in leaves])
+    return hidden
+
+
 def as_arguments(name: str, tree: T, dtype: Any) -> T:
     """Returns the tree as JAX can trace it: numbers cast to `dtype` (see `cast`), other leaves hidden.
 
@@ -351,7 +361,7 @@ def as_arguments(name: str, tree: T, dtype: Any) -> T:
     """
 
     def convert(leaf: Any) -> Any:
-        if _is_number(leaf):
+        if is_number(leaf):
             return _cast(leaf, dtype)
         try:
             hash(leaf)
@@ -364,7 +374,7 @@ def as_arguments(name: str, tree: T, dtype: Any) -> T:
 
 
 def reveal(tree: T) -> T:
-    """Returns the tree with what `as_arguments` has hidden."""
+    """Returns the tree with what `hide` or `as_arguments` has hidden."""
 
     def is_hidden(node: Any) -> bool:
         return isinstance(node, Hidden)

@@ -17,6 +17,7 @@ SLOW = {  # a minute of compiling each, or what the package's own tests hold any
     "gradient_accuracy",
     "gradient_cost",
     "kill_and_resume",
+    "mean_derivative",
     "open_pages",
     "recover_parameters",
     "reference_times",

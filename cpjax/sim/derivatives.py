@@ -151,7 +151,7 @@ def may_switch(controller: Any) -> bool:
 def watched(tree: Any) -> Any:
     """Returns the tree; differentiating it warns that the derivative misses the change of mode."""
     leaves, structure = jax.tree.flatten(tree)
-    real_ones = [i for i, leaf in enumerate(leaves) if jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)]
+    real_ones = [i for i, leaf in enumerate(leaves) if jnp.issubdtype(getattr(leaf, "dtype", int), jnp.floating)]
     for i, leaf in zip(real_ones, _watched([leaves[i] for i in real_ones]), strict=True):
         leaves[i] = leaf
     return jax.tree.unflatten(structure, leaves)

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cpjax.pytree import is_number
+
 
 class Flag(enum.IntFlag):
     """Bits of `Trajectory.flag` and `Metrics.flag`; 0 is a clean run."""
@@ -42,6 +44,6 @@ def describe(flag: int) -> str:
 
 
 def unknown(tree: Any) -> jax.Array:
-    """NON_FINITE if a leaf of the tree is NaN, else 0; int32."""
-    leaves = jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(tree)])
+    """Returns NON_FINITE if a number of the tree is NaN, else 0; int32."""
+    leaves = jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(tree) if is_number(leaf)])
     return jnp.where(jnp.any(leaves), int(Flag.NON_FINITE), 0).astype(jnp.int32)
