@@ -11,6 +11,7 @@ out calls into other libraries (a solver, a callback). Only speed depends on the
 """
 
 import functools
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +22,7 @@ from jaxlib.mlir import ir
 from jaxlib.mlir.dialects import func
 
 from cpjax import runtime
+from cpjax.errors import PerformanceWarning
 from cpjax.pytree import hide, reveal
 
 LARGEST = 1 << 14
@@ -33,7 +35,7 @@ stablehlo.cbrt stablehlo.ceil stablehlo.clamp stablehlo.compare stablehlo.concat
 stablehlo.convert stablehlo.cosine stablehlo.divide stablehlo.dynamic_slice stablehlo.dynamic_update_slice
 stablehlo.exponential stablehlo.exponential_minus_one stablehlo.floor stablehlo.iota stablehlo.is_finite
 stablehlo.log stablehlo.log_plus_one stablehlo.logistic stablehlo.maximum stablehlo.minimum stablehlo.multiply
-stablehlo.negate stablehlo.not stablehlo.or stablehlo.pad stablehlo.popcnt stablehlo.power stablehlo.remainder
+stablehlo.negate stablehlo.not stablehlo.or stablehlo.popcnt stablehlo.power stablehlo.remainder
 stablehlo.reshape stablehlo.reverse stablehlo.round_nearest_afz stablehlo.round_nearest_even stablehlo.rsqrt
 stablehlo.select stablehlo.shift_left stablehlo.shift_right_arithmetic stablehlo.shift_right_logical
 stablehlo.sign stablehlo.sine stablehlo.slice stablehlo.sqrt stablehlo.subtract stablehlo.tan stablehlo.tanh
@@ -136,8 +138,18 @@ def _mark_whole(symbols: Any, owners: list[Any]) -> None:
     calls = [owner for owner in owners if getattr(owner, "name", "") == "func.call"]
     for name in {call.attributes["callee"].value for call in calls}:
         function = symbols[name]
-        if f"{name}_whole" not in symbols and _allowed(function, symbols):
+        if f"{name}_whole" in symbols:
+            continue
+        others = _others(function, symbols)
+        if not others:
             _move_body(function, f"{name}_whole", symbols)
+        elif slow := sorted(others & _SLOW.keys()):
+            message = (
+                f"this simulation's loop contains {' and '.join(_SLOW[name] for name in slow)}, which keeps XLA from "
+                "compiling it as one function on a CPU: expect it to be several times slower. A small product of "
+                "matrices can be written as a sum over products of numbers (docs/performance.md)"
+            )
+            warnings.warn(message, PerformanceWarning, stacklevel=2)
 
 
 def _move_body(function: Any, name: str, symbols: Any) -> None:
@@ -177,22 +189,30 @@ def _attributes(*names: str) -> Any:
     return ir.DictAttr.get(attributes)
 
 
-def _allowed(function: Any, symbols: Any) -> bool:
-    """Whether all operations in the function, and in those it calls, are known to work."""
+_SLOW = {
+    "stablehlo.dot_general": "a product of matrices",
+    "stablehlo.custom_call": "a call into another library (a solver, a callback)",
+    "stablehlo.sort": "a sort",
+}
+"""Operations that a user's law may bring in, in words."""
+
+
+def _others(function: Any, symbols: Any) -> set[str]:
+    """Returns the operations in the function, and in those it calls, that are not known to work."""
     names = _ALLOWED.split()
-    waiting, known, allowed = [function], {function.attributes["sym_name"].value}, True
+    waiting, known, others = [function], {function.attributes["sym_name"].value}, set()
 
     def look(operation: Any) -> Any:
-        nonlocal allowed
         if operation.name == "func.call" and operation.attributes["callee"].value not in known:
             known.add(operation.attributes["callee"].value)
             waiting.append(symbols[operation.attributes["callee"].value])
-        allowed = allowed and operation.name in names
+        if operation.name not in names:
+            others.add(operation.name)
         return ir.WalkResult.ADVANCE
 
-    while waiting and allowed:
+    while waiting:
         waiting.pop().operation.walk(look)
-    return allowed
+    return others
 
 
 _whole, _part = _Marks("one_function", _mark_whole), _Marks("part_of_step", _mark_part)

@@ -16,6 +16,7 @@ import functools
 import hashlib
 import os
 import platform
+import warnings
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from cpjax.errors import InputError
+from cpjax.errors import InputError, PerformanceWarning
 
 TESTED = ("0.10.2",)
 """The versions of jaxlib with which the options were tested."""
@@ -126,8 +127,15 @@ def fast_loops() -> bool:
 
 @functools.cache
 def is_tested() -> bool:
-    """Whether jaxlib is a version with which all that XLA does not document was tested."""
-    return version("jaxlib") in TESTED
+    """Whether jaxlib is a version with which all that XLA does not document was tested. Warns, once, if it is not."""
+    tested = version("jaxlib") in TESTED
+    if not tested:
+        message = (
+            f"jaxlib {version('jaxlib')} was not tested with cpjax's ways to make XLA fast on a CPU, so they are left "
+            f"out: expect simulations to be several times slower than with jaxlib {' or '.join(TESTED)}"
+        )
+        warnings.warn(message, PerformanceWarning, stacklevel=2)
+    return tested
 
 
 def compiler_options(platform: str) -> dict[str, Any]:

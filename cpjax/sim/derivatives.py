@@ -19,6 +19,10 @@ instant of the change. That makes the error of the mean one of second order in T
 Whatever sits in the loop, estimator, delay or memory, the command that the old mode would have led to is found by
 running the controller a second time with its mode held. The parts that have a mode are found inside any controller and
 replaced, by one that also tracks its margin (`Tracked`) and one that holds its mode (`Holding`).
+
+Two limits. The plant has to be affine in its input, as any with a motor is. And a command that a controller keeps in
+its memory, to return it later, as a dead time does, is replaced to first order only: a metric that is not linear in the
+voltage, such as the effort, then has the slope of its integrand where it should have the difference.
 """
 
 import warnings
