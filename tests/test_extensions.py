@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from extensions import dead_time, furuta, observer, pid, square_wave
+from extensions import dead_time, furuta, observer, pid, square_wave, walled
 from oracles import columns, derivative
 from scipy.integrate import solve_ivp
 
@@ -303,3 +303,83 @@ def test_another_plants_initial_state_is_checked_by_its_own_names():
         cpjax.rollout(FURUTA, furuta.controller(FURUTA), furuta.FurutaState(0.0, 2e3, 0.0, 0.0), **CAUGHT)
     with pytest.raises(cpjax.InputError, match=r"metrics = None: must be given"):
         cpjax.measure(FURUTA, furuta.controller(FURUTA), furuta.START, **CAUGHT)
+
+
+# --- a plant with events ----------------------------------------------------------------------------------------------
+
+WALLED = walled.Walled(PLANT, 0.2, 0.6)
+PUSHED = cpjax.State(0.0, 0.3, 2.6, 0.0)
+
+
+class Pushing:
+    """A voltage signal that drives the cart from wall to wall."""
+
+    times = np.array([0.0, 0.3, 0.7, 1.1])
+    voltages = np.array([6.0, -6.0, 8.0, -8.0])
+
+
+def bounced_by_scipy(duration):
+    """The end of the run, with SciPy's events for the walls, and how often it bounces."""
+    s, t, bounces = columns(PUSHED), 0.0, 0
+    while t < duration - 1e-12:
+        voltage = Pushing.voltages[np.flatnonzero(Pushing.times <= t + 1e-9)[-1]]
+        later = Pushing.times[Pushing.times > t + 1e-9]
+        end = min(duration, later[0]) if later.size else duration
+        wall = lambda t, s: 0.2 - abs(s[0])  # noqa: E731
+        wall.terminal, wall.direction = True, -1
+        field = lambda t, s, u=voltage: derivative(PLANT, s, u)  # noqa: E731
+        piece = solve_ivp(field, (t, end), s, method="DOP853", rtol=1e-12, atol=1e-13, events=wall)
+        s, t = piece.y[:, -1].copy(), piece.t[-1]
+        if piece.status == 1:
+            bounces += 1
+            change = -1.6 * s[1]
+            s[3] += PLANT.pole_mass * PLANT.pole_length * math.cos(s[2]) * change / PLANT.pivot_inertia
+            s[1] += change
+            s[0] = math.copysign(0.2 - 1e-15, s[0])
+    return s, bounces
+
+
+def test_the_events_of_a_plant_are_located_on_the_sampled_clock():
+    end, bounces = bounced_by_scipy(1.4)
+    assert bounces == 3
+    signal = cpjax.VoltageSignal(Pushing.times, Pushing.voltages)
+    run = cpjax.rollout(WALLED, signal, PUSHED, duration=1.4, dt=0.001, control_period=0.02)
+    assert int(run.flag) == 0
+    assert np.max(np.abs(columns(run.state)[-1] - end)) <= 1e-8
+    assert np.max(np.abs(np.asarray(run.state.x))) <= 0.2 + 1e-12
+    starts = many(PUSHED, 4)
+    mapped = jax.vmap(lambda s: cpjax.measure(WALLED, signal, s, duration=1.4, dt=0.001, metrics=cpjax.TimeOutside()))
+    swept = cpjax.sweep(WALLED, signal, starts, duration=1.4, dt=0.001, metrics=cpjax.TimeOutside())
+    assert_close(swept, mapped(starts), 1e-9)
+
+
+def test_the_derivative_through_a_plants_events_is_that_of_differences():
+    def end(p):
+        plant = dataclasses.replace(WALLED, restitution=p[0], half_length=p[1])
+        signal = cpjax.VoltageSignal(Pushing.times, Pushing.voltages * p[2])
+        run = cpjax.rollout(plant, signal, PUSHED, duration=1.0, dt=0.002, save_every=500)
+        return run.state.theta[-1] + run.state.x[-1]
+
+    p = jnp.array([0.6, 0.2, 1.0])
+    gradient, value = jax.grad(end)(p), jax.jit(end)
+    np.testing.assert_allclose(jax.jacfwd(end)(p), gradient, rtol=1e-8)
+    for i in range(3):
+        whole = jnp.zeros(3).at[i].set(p[i])
+        found = central_differences(lambda h, e=whole: (value(p + h * e), value(p - h * e)), STEPS).derivative
+        assert float(gradient[i] * p[i]) == pytest.approx(float(found), rel=1e-6)
+
+
+def test_on_the_continuous_clock_the_walls_stand_beside_clip_and_gate():
+    controller = cpjax.paper.controller("corrected-centred", "placement", PLANT)
+    walls = dataclasses.replace(WALLED, half_length=0.35)
+    fine, coarse = (
+        cpjax.rollout(
+            walls, controller, cpjax.HANGING, duration=1.5, dt=dt, clock="continuous", save_every=round(0.5 / dt)
+        )
+        for dt in (0.001, 0.002)
+    )
+    assert int(fine.flag) == 0
+    assert np.max(np.abs(np.asarray(fine.state.x))) <= 0.35 + 1e-12
+    assert np.max(np.abs(columns(fine.state) - columns(coarse.state))) <= 1e-6
+    with pytest.raises(cpjax.InputError, match=r"switching = 'per_step': must be located, or absent, for a plant with"):
+        cpjax.rollout(walls, controller, cpjax.HANGING, duration=0.1, dt=0.002, switching="per_step")
