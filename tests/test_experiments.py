@@ -22,6 +22,7 @@ SLOW = {  # a minute of compiling each, or what the package's own tests hold any
     "recover_parameters",
     "reference_times",
     "riccati_accuracy",
+    "sweep_against_measure",
     "start_up",
     "success_table",
     "tune_anywhere",

@@ -47,7 +47,8 @@ def newton_correction(value: Scalar, slope: Scalar, steepness: Scalar) -> jax.Ar
     """The step from a time at which a falling function has this `value` to where it is zero: -value / slope.
 
     Its derivative is -1 / slope, as the implicit function theorem has it; the slope's own derivative is left out, for
-    it is multiplied by `value`, which is almost zero. So first derivatives are exact, and only those.
+    it is multiplied by `value`, which is almost zero. So first derivatives are exact, and only those. (Of
+    two corrections, one after the other, second derivatives are exact too.)
 
     Args:
       slope: dg/dt there [per unit of time]. One that is not clearly negative, as where g only touches zero, is taken

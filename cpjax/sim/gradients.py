@@ -26,6 +26,18 @@ class Gradients(NamedTuple):
     gradient: Any
     """The parameters' tree, each leaf with a leading axis n."""
 
+    @property
+    def finite(self) -> jax.Array:
+        """Whether the value and all numbers of the gradient are finite (n,).
+
+        A derivative can overflow where the run itself is clean: exactly upright at rest, a perturbation grows by
+        powers of ten every second, in float32 soon beyond the largest number. No flag of the run tells.
+        """
+        count = self.value.shape[0]
+        leaves = (self.value, *jax.tree.leaves(self.gradient))
+        good = [jnp.all(jnp.isfinite(leaf).reshape(count, -1), axis=1) for leaf in leaves]
+        return jnp.all(jnp.stack(good), axis=0)
+
 
 def gradients(
     objective: Objective, parameters: Any, starts: State, *, direction: Direction = "reverse", chunk: int = 64

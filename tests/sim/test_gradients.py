@@ -102,3 +102,12 @@ def test_segments_keep_less():
         for c in ("every_step", "segments")
     ]
     assert memory[1] < 0.3 * memory[0]
+
+
+def test_a_gradient_that_overflows_is_told_for_each_start():
+    def grown(p, start):
+        return p * jnp.exp(start.x)
+
+    starts = cpjax.State(jnp.array([1.0, 800.0, 2.0]), jnp.zeros(3), jnp.zeros(3), jnp.zeros(3))
+    found = cpjax.gradients(grown, jnp.asarray(1.0), starts)
+    assert found.finite.tolist() == [True, False, True]
