@@ -49,7 +49,8 @@ class Controller(Protocol):
     def update(self, memory: Any, measurement: Any) -> tuple[Any, Scalar]:
         """Returns the new memory, of the same structure, shapes and dtypes, and the command [V], a scalar.
 
-        Called once per control period. The drive clips the command and holds it until the next update.
+        What it returns counts once per control period: the drive clips the command and holds it until the next one. (It
+        is evaluated at every step of the integrator, and dropped between control instants.)
         """
         ...
 
@@ -112,7 +113,7 @@ class ModeMemory(NamedTuple):
 
 
 def modes_in(memory: Any) -> list[ModeMemory]:
-    """Returns every `ModeMemory` in a controller's memory, outermost first."""
+    """Returns every `ModeMemory` in a controller's memory, in the order of its leaves."""
     nodes = jax.tree.leaves(memory, is_leaf=lambda node: isinstance(node, ModeMemory))
     return [node for node in nodes if isinstance(node, ModeMemory)]
 
@@ -130,7 +131,8 @@ def start_memory(controller: ModalController, state: State) -> ModeMemory:
 
 def demand(controller: ModalController, state: State, mode: jax.Array) -> jax.Array:
     """Returns the voltage [V] that the law of `mode` demands, in the state's dtype."""
-    return real("controller.mode_voltage", call("controller", controller, "mode_voltage", state, mode))
+    dtype = jnp.asarray(jax.tree.leaves(state)[0]).dtype
+    return real("controller.mode_voltage", call("controller", controller, "mode_voltage", state, mode), dtype)
 
 
 @pytree
@@ -208,12 +210,21 @@ def as_sampled(controller: Any) -> Controller:
 
 
 def at_period(controller: Any, period: Scalar) -> Any:
-    """Returns the controller with every `Clocked` part told the control period [s]."""
-
-    def is_clocked(node: Any) -> bool:
-        return isinstance(node, Clocked) and not isinstance(node, type)
+    """Returns the controller with every `Clocked` part told the control period [s], inner parts before outer ones."""
 
     def told(node: Any) -> Any:
-        return call("controller", node, "at_period", period) if is_clocked(node) else node
+        if not _is_clocked(node):
+            return node
+        inner = jax.tree.map(told, node, is_leaf=lambda one: one is not node and _is_clocked(one))
+        return call("controller", inner, "at_period", period)
 
-    return jax.tree.map(told, controller, is_leaf=is_clocked)
+    return jax.tree.map(told, controller, is_leaf=_is_clocked)
+
+
+def is_clocked(controller: Any) -> bool:
+    """Whether any part of a controller depends on the control period."""
+    return any(_is_clocked(node) for node in jax.tree.leaves(controller, is_leaf=_is_clocked))
+
+
+def _is_clocked(node: Any) -> bool:
+    return isinstance(node, Clocked) and not isinstance(node, type)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from cpjax.compilation import part_of_step
 from cpjax.controllers.protocol import SmoothController, demand
+from cpjax.errors import InputError
 from cpjax.returned import call, integer, real
 from cpjax.sim import plants
 from cpjax.sim.plants import Plant, Tree
@@ -42,12 +43,12 @@ class ContinuousLoop(NamedTuple):
     too.
     """
 
-    plant: Plant
+    plant: Any
     controller: SmoothController
 
     def observe(self, q: Tree, v: Tree, mode: Mode) -> Observation:
         state = plants.state_of(self.plant, q, v)
-        limit = input_limit(self.plant)
+        limit = self.plant.input_limit
         demanded = self._demand(state, mode.law)
         relative = demanded / limit  # 0 for an infinite supply
         margin = real("controller.margin", call("controller", self.controller, "margin", state, mode.law))
@@ -86,11 +87,11 @@ class ContinuousLoop(NamedTuple):
         return Mode(law, self._clip(start, law), plants.start_mode(self.plant, *plants.coordinates(self.plant, start)))
 
     def _clip(self, state: Tree, law: jax.Array) -> jax.Array:
-        demanded, limit = self._demand(state, law), input_limit(self.plant)
+        demanded, limit = self._demand(state, law), self.plant.input_limit
         return (demanded > limit).astype(jnp.int32) - (demanded < -limit).astype(jnp.int32)
 
     def _demand(self, state: Tree, law: jax.Array) -> jax.Array:
-        return demand(self.controller, state, law).astype(dtype_of(state))
+        return demand(self.controller, state, law)
 
 
 class HeldMode(NamedTuple):
@@ -119,11 +120,6 @@ class HeldLoop(NamedTuple):
 System: TypeAlias = ContinuousLoop | HeldLoop
 
 
-def input_limit(plant: Any) -> Any:
-    """Returns the magnitude at which the plant's drive clips."""
-    return plant.input_limit
-
-
 def plant_accelerations(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Tree:
     """Returns q''."""
     geometry = plants.geometry(plant, q)
@@ -135,11 +131,17 @@ def plant_guards(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Gu
     if not plants.has_events(plant):
         return ()
     guards = call("plant", plant, "guards", q, v, u, mode)
+    if not isinstance(guards, tuple):
+        raise InputError("plant.guards", f"a {type(guards).__name__}", "a tuple of scalars")
     return tuple(real(f"plant.guards[{i}]", guard, u.dtype) for i, guard in enumerate(guards))
 
 
 def plant_jump(plant: Any, q: Tree, v: Tree, mode: Tree, guard: jax.Array) -> tuple[Tree, Tree, Tree]:
     """Returns positions, velocities and the plant's mode after one of its own guards has fallen."""
-    q_after, v_after, mode_after = call("plant", plant, "jump", q, v, mode, guard)
+    after = call("plant", plant, "jump", q, v, mode, guard)
+    found: Any = jax.tree.structure(after)
+    if found != jax.tree.structure((q, v, mode)):
+        raise InputError("plant.jump", str(found), "positions, velocities and mode, as given")
     cast = lambda new, old: jnp.asarray(new, dtype=jnp.asarray(old).dtype)  # noqa: E731
-    return jax.tree.map(cast, (q_after, v_after, mode_after), (q, v, mode))
+    jumped: tuple[Tree, Tree, Tree] = jax.tree.map(cast, after, (q, v, mode))
+    return jumped

@@ -9,7 +9,7 @@ from cpjax.controllers.protocol import ModeMemory, as_sampled, modes_in, start_m
 from cpjax.pytree import cast
 from cpjax.returned import call, integer, like, pair, real
 from cpjax.sim import plants
-from cpjax.sim.derivatives import difference, holding, shift_of, shifted, tracked
+from cpjax.sim.derivatives import difference, holding, shift_of, shifted, tracked, with_zeros
 from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.settings import Settings
 from cpjax.sim.stepper import applied_voltage, dtype_of
@@ -24,8 +24,10 @@ class Blend(NamedTuple):
     """By how much of the period that change of mode moves: value 0, with a derivative."""
     voltage_echo: jax.Array
     """What the change of mode in the period before adds to the voltage: value 0."""
-    memory_echo: Any
-    """What this period's change of mode will add to the memory in the next: zeros, of the memory's float leaves."""
+    memory_echo: tuple[jax.Array, ...]
+    """What this period's change of mode will add to the memory in the next: zeros."""
+    mode: jax.Array
+    """The mode until this period, int32."""
 
 
 class Control(NamedTuple):
@@ -46,7 +48,7 @@ class Control(NamedTuple):
 
     @property
     def mode(self) -> jax.Array:
-        """The mode that a trajectory records: of the outermost part of the memory that has one, else 0."""
+        """The mode that a trajectory records: the first one in the memory, else 0."""
         modes = modes_in(self.memory)
         return modes[0].mode if modes else jnp.asarray(0, dtype=jnp.int32)
 
@@ -63,7 +65,8 @@ def start_control(plant: Plant, controller: Any, start: Tree, settings: Settings
     if first.blend is None:
         return Control(memory, first.voltage)
     nothing = jax.tree.map(jnp.zeros_like, first.blend)
-    return Control(memory, first.voltage, nothing._replace(held=first.voltage))
+    mode = Control(memory, first.voltage).mode
+    return Control(memory, first.voltage, nothing._replace(held=first.voltage, mode=mode))
 
 
 def update_control(plant: Plant, controller: Any, before: Control, state: Tree, settings: Settings) -> Control:
@@ -82,12 +85,12 @@ def update_control(plant: Plant, controller: Any, before: Control, state: Tree, 
     nothing = jnp.zeros_like(voltage)
     echo = nothing
     if before.blend is not None:
-        updated = _with_echo(updated, before.blend.memory_echo)
+        updated = with_zeros(updated, before.blend.memory_echo)
         echo = shifted(nothing, before.blend.held - before.voltage, -0.5 * before.blend.shift)
     gap = difference(unchanged, updated)
-    memory = _with_echo(updated, shifted(jax.tree.map(jnp.zeros_like, gap), gap, 1.5 * shift))
-    memory_echo = shifted(jax.tree.map(jnp.zeros_like, gap), gap, -0.5 * shift)
-    return Control(memory, voltage, Blend(held, shift, echo, memory_echo))
+    zeros = jax.tree.map(jnp.zeros_like, gap)
+    memory = with_zeros(updated, shifted(zeros, gap, 1.5 * shift))
+    return Control(memory, voltage, Blend(held, shift, echo, shifted(zeros, gap, -0.5 * shift), before.mode))
 
 
 def _updated(controller: Any, memory: Any, state: Tree) -> tuple[Any, jax.Array]:
@@ -95,14 +98,3 @@ def _updated(controller: Any, memory: Any, state: Tree) -> tuple[Any, jax.Array]
     updated, command = pair("controller.update", returned, "the new memory and the command")
     dtype = dtype_of(state)
     return like("controller.update: memory", cast(updated, dtype), memory), real("controller.update", command, dtype)
-
-
-def _with_echo(memory: Any, echo: Any) -> Any:
-    """Returns a memory with the zeros of `difference` added, for their derivative."""
-    leaves, structure = jax.tree.flatten(memory, is_leaf=_is_mode)
-    zeros = jax.tree.leaves(echo, is_leaf=lambda node: node is None)
-    return jax.tree.unflatten(structure, [a if b is None else a + b for a, b in zip(leaves, zeros, strict=True)])
-
-
-def _is_mode(node: Any) -> bool:
-    return isinstance(node, ModeMemory)

@@ -20,7 +20,8 @@ Whatever sits in the loop, estimator, delay or memory, the command that the old 
 running the controller a second time with its mode held. The parts that have a mode are found inside any controller and
 replaced, by one that also tracks its margin (`Tracked`) and one that holds its mode (`Holding`).
 
-Two limits. The plant has to be affine in its input, as any with a motor is. And a command that a controller keeps in
+Three limits. The plant has to be affine in its input, as any with a motor is. A metric gets the difference between two
+voltages, but a function of a saved trajectory's voltage gets the slope there. And a command that a controller keeps in
 its memory, to return it later, as a dead time does, is replaced to first order only: a metric that is not linear in the
 voltage, such as the effort, then has the slope of its integrand where it should have the difference.
 """
@@ -32,7 +33,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import (
+    Controller,
+    ModalController,
     ModeMemory,
     Sampled,
     SingleLaw,
@@ -43,7 +47,7 @@ from cpjax.controllers.protocol import (
 )
 from cpjax.errors import DerivativeWarning, InputError
 from cpjax.pytree import Scalar, part, pytree
-from cpjax.returned import call, real
+from cpjax.returned import call, integer, real
 
 _NEEDS = ("start_mode", "next_mode", "mode_voltage", "margin", "successor")
 
@@ -54,13 +58,18 @@ class Tracked:
 
     controller: SmoothController = part("a controller with modes", *_NEEDS)
 
+    def __getattr__(self, name: str) -> Any:
+        return getattr(object.__getattribute__(self, "controller"), name)
+
     def init(self, measurement: Any) -> ModeMemory:
         mode = start_memory(self.controller, measurement).mode
         margin = _margin(self.controller, measurement, mode)
         return ModeMemory(mode, margin, jnp.zeros_like(margin))
 
     def update(self, memory: ModeMemory, measurement: Any) -> tuple[ModeMemory, Scalar]:
-        mode = jnp.asarray(call("controller", self.controller, "next_mode", measurement, memory.mode), dtype=jnp.int32)
+        mode = integer(
+            "controller.next_mode", call("controller", self.controller, "next_mode", measurement, memory.mode)
+        )
         before, after = memory.margin, _margin(self.controller, measurement, memory.mode)
         assert before is not None
         crossed = (mode != memory.mode) & (before > 0.0) & (after < 0.0)
@@ -75,6 +84,9 @@ class Holding:
     """The same controller with its mode held: what it would have commanded, had the mode not changed."""
 
     controller: SmoothController = part("a controller with modes", *_NEEDS)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(object.__getattribute__(self, "controller"), name)
 
     def init(self, measurement: Any) -> ModeMemory:
         return Tracked(self.controller).init(measurement)
@@ -115,12 +127,13 @@ def shifted(new: Any, old: Any, shift: jax.Array) -> Any:
     Args:
       new, old: trees of one structure.
     """
-    return new
+    # Always `new`; written so that under vmap the value is a batch wherever its derivative is one.
+    return jax.tree.map(lambda a, b: jnp.where(shift == 0.0, a, b), new, old)
 
 
 @shifted.defjvp
 def _shifted_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    new, old, _ = primals
+    new, old, shift = primals
     d_new, _, d_shift = tangents
 
     def moved(new: jax.Array, old: jax.Array, tangent: Any) -> Any:
@@ -129,27 +142,48 @@ def _shifted_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
         jump = old - new  # of two infinities, such as a settling time that is not known yet, it is NaN
         return tangent + jnp.where(jnp.isfinite(jump), jump, 0.0) * d_shift
 
-    return new, jax.tree.map(moved, new, old, d_new)
+    return shifted(new, old, shift), jax.tree.map(moved, new, old, d_new)
 
 
-def difference(held: Any, updated: Any) -> Any:
-    """Returns by how much a controller's memory would differ, had its mode been held: of the float leaves.
+def difference(held: Any, updated: Any) -> tuple[jax.Array, ...]:
+    """Returns by how much a controller's memory would differ, had its mode been held: each of its float leaves.
 
-    None stands for other leaves, and for modes and their margins, which belong to the mode that was chosen.
+    Modes and their margins are left out: they belong to the mode that was chosen.
     """
-
-    def is_mode(node: Any) -> bool:
-        return isinstance(node, ModeMemory)
-
-    def less(a: Any, b: Any) -> Any:
-        return None if is_mode(a) or not jnp.issubdtype(jnp.asarray(a).dtype, jnp.floating) else a - b
-
-    return jax.tree.map(less, held, updated, is_leaf=is_mode)
+    pairs = zip(_parts(held), _parts(updated), strict=True)
+    return tuple(a - b for a, b in pairs if _is_float(b))
 
 
-def may_switch(controller: Any) -> bool:
-    """Whether a controller has a part with modes, as far as can be seen."""
-    return any(_has_modes(one) for one in jax.tree.leaves(controller, is_leaf=_has_modes))
+def with_zeros(memory: Any, zeros: tuple[jax.Array, ...]) -> Any:
+    """Returns a memory with zeros added to its float leaves, for their derivative; as many as `difference` returns."""
+    left = iter(zeros)
+    parts = [part + next(left) if _is_float(part) else part for part in _parts(memory)]
+    return jax.tree.unflatten(jax.tree.structure(memory, is_leaf=_is_mode), parts)
+
+
+def _parts(memory: Any) -> list[Any]:
+    return jax.tree.leaves(memory, is_leaf=_is_mode)
+
+
+def _is_mode(node: Any) -> bool:
+    return isinstance(node, ModeMemory)
+
+
+def _is_float(part: Any) -> bool:
+    return not _is_mode(part) and jnp.issubdtype(jnp.asarray(part).dtype, jnp.floating)
+
+
+def may_switch(controller: Any, start: Any) -> bool:
+    """Whether a controller has a mode, as far as can be seen: a part with modes, or a memory with one."""
+
+    def is_modal(node: Any) -> bool:
+        return isinstance(node, ModalController) and not isinstance(node, (type, SingleLaw))
+
+    if any(is_modal(node) for node in jax.tree.leaves(controller, is_leaf=is_modal)):
+        return True
+    if not isinstance(controller, Controller):
+        return False
+    return bool(modes_in(jax.eval_shape(lambda: call("controller", controller, "init", start))))
 
 
 def watched(tree: Any) -> Any:
@@ -182,13 +216,26 @@ def _margin(controller: SmoothController, state: Any, mode: jax.Array) -> jax.Ar
     return real("controller.margin", call("controller", controller, "margin", state, mode), dtype)
 
 
-def _has_modes(node: Any) -> bool:
-    return isinstance(node, (SmoothController, Sampled)) and not isinstance(node, (type, SingleLaw))
-
-
 def _replaced(controller: Any, kind: type) -> Any:
-    def replace(node: Any) -> Any:
-        inner = node.controller if isinstance(node, Sampled) else node
-        return kind(inner) if _has_modes(node) and isinstance(inner, SmoothController) else node
+    """Returns the controller with every part whose whole memory is a mode in a `kind`.
 
-    return jax.tree.map(replace, controller, is_leaf=_has_modes)
+    Raises:
+      InputError: a part with modes has a memory of its own beside them.
+    """
+
+    def is_modal(node: Any) -> bool:
+        return isinstance(node, (SmoothController, Sampled)) and not isinstance(node, (type, SingleLaw))
+
+    def replace(node: Any) -> Any:
+        if not is_modal(node):
+            return node
+        inner = node.controller if isinstance(node, Sampled) else node
+        if isinstance(node, Controller) and not isinstance(node, (Hybrid, Sampled)):
+            allowed = (
+                f"pathwise: {type(node).__name__} has modes and a memory of its own. Let a controller with memory hold "
+                "a cpjax.Hybrid instead"
+            )
+            raise InputError("derivative", "mean", allowed)
+        return kind(inner) if isinstance(inner, SmoothController) else node
+
+    return jax.tree.map(replace, controller, is_leaf=is_modal)

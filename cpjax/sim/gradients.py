@@ -82,7 +82,7 @@ def _gradients(parameters: Any, starts: State, *, objective: Objective, directio
         value, gradient = jax.jacfwd(lambda p: (objective(p, start),) * 2, has_aux=True)(parameters)[::-1]
         return Gradients(value, gradient)
 
-    total = jnp.shape(starts.x)[0]
+    total = jax.tree.leaves(starts)[0].shape[0]
     count = math.ceil(total / chunk)
     size = math.ceil(total / count)  # as even as can be
     members = jnp.minimum(jnp.arange(count * size), total - 1).reshape(count, size)

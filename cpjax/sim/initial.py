@@ -49,18 +49,18 @@ def checked_tree(
     dtypes = {}
     for name, value, limit in zip(names, leaves, jax.tree.leaves(limits), strict=True):
         path = f"{field}.{name}"
-        within = f"finite, and within {limit:g} {units.get(name, '')}".rstrip()
         if isinstance(value, bool) or not (isinstance(value, (int, float)) or hasattr(value, "dtype")):
             raise InputError(path, value, "a real number or an array of them")
         if isinstance(value, (int, float)):
-            if not abs(value) <= limit:
-                raise InputError(path, value, within)
+            if not is_traced(limit) and not abs(value) <= limit:
+                raise InputError(path, value, _within(limit, units.get(name, "")))
         else:
             dtypes[name] = jnp.dtype(value.dtype) if is_traced(value) else jax.dtypes.canonicalize_dtype(value.dtype)
             if dtypes[name] not in (jnp.float32, jnp.float64):
                 raise InputError(path, f"array of dtype {value.dtype}", "of dtype float32 or float64")
-            if not is_traced(value) and not np.all(np.abs(np.asarray(value)) <= limit):
-                raise InputError(path, value, within)
+            known = not is_traced(value) and not is_traced(limit)
+            if known and not np.all(np.abs(np.asarray(value)) <= np.asarray(limit)):
+                raise InputError(path, value, _within(limit, units.get(name, "")))
     name_of_type = type(start).__name__
     if len(set(dtypes.values())) > 1:
         mixture = ", ".join(f"{name}: {dtype}" for name, dtype in dtypes.items())
@@ -83,6 +83,10 @@ def checked_tree(
                 allowed = "one number; many starts go through cpjax.sweep or jax.vmap"
                 raise InputError(f"{field}.{name}", f"array of shape {value.shape}", allowed)
     return jax.tree.unflatten(structure, values), dtype, count
+
+
+def _within(limit: Any, unit: str) -> str:
+    return f"finite, and within {float(np.max(limit)):g} {unit}".rstrip()
 
 
 @functools.cache

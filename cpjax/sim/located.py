@@ -15,15 +15,15 @@ import numpy as np
 
 from cpjax.compilation import one_function, part_of_step
 from cpjax.errors import InputError
-from cpjax.returned import call, like
+from cpjax.returned import call
 from cpjax.sim import failures, plants
-from cpjax.sim.closed_loop import ContinuousLoop, HeldLoop, HeldMode, System
+from cpjax.sim.closed_loop import GATE_CROSSING, ContinuousLoop, HeldLoop, HeldMode, System
 from cpjax.sim.control import Control, start_control, update_control
 from cpjax.sim.flags import CHATTER_LENGTH, Flag, unknown
 from cpjax.sim.integrators import INTEGRATORS, Integrator
 from cpjax.sim.kept import pack
 from cpjax.sim.metrics import Fold, Sample
-from cpjax.sim.per_step import sees_the_voltage, update_metric
+from cpjax.sim.per_step import sees_the_voltage, start_metric, update_metric
 from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
@@ -65,13 +65,13 @@ def simulate(
     motion = start_motion(system, q, v, mode, dt)
     loop = _Loop(motion, flag, motion.seen.output, _law(motion, control), control, jnp.zeros_like(flag))
     first = _sample(plant, loop, motion, dt)
-    started = call("metrics", fold, "init", first)
+    started = start_metric(fold, first)
     if settings.derivative == "mean" and sees_the_voltage(fold, started, first):
         allowed = "pathwise, for a plant with events and a metric that depends on the voltage"
         raise InputError("derivative", "mean", allowed)
 
     run = one_function(functools.partial(_run, settings=settings), stacks=True)
-    carry = (loop, fold.update(started, first))
+    carry = (loop, update_metric(fold, started, first))
     carry, kept = run(carry, plant, controller, fold, dt)
     loop, memory = carry
     last = _sample(plant, loop, loop.motion, dt)
@@ -82,7 +82,7 @@ def simulate(
         wanted = jnp.arange(settings.save_every, settings.steps, settings.save_every, dtype=passed.dtype)
         rows = jnp.searchsorted(passed, wanted)
         samples = jnp.concatenate([pack(first)[None], samples[rows]])
-    return samples, last, fold.finish(memory, last)
+    return samples, last, call("metrics", fold, "finish", memory, last)
 
 
 def _run(
@@ -98,7 +98,7 @@ def _run(
         before, memory = carry
         loop, reached = _advance(plant, controller, before, dt, settings, iterations - index)
         sample = _sample(plant, loop, before.motion, dt)
-        after = like("metrics.update", part_of_step(update_metric)(fold, memory, sample), memory)
+        after = part_of_step(update_metric)(fold, memory, sample)
         updated = after, sample.voltage, sample.mode
         kept = memory, loop.voltage, loop.mode
         memory, voltage, mode = jax.tree.map(lambda new, old: jnp.where(reached, new, old), updated, kept)
@@ -132,7 +132,7 @@ def _sample(plant: Plant, loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
         outputs=plants.outputs(plant, state, motion.seen.acceleration, motion.seen.output),
         plant_mode=motion.mode.plant,
         flag=loop.flag,
-        crossing=jnp.where(landed, before.guard + 1, 0),
+        crossing=jnp.where(landed, before.guard + (GATE_CROSSING if held else 0) + 1, 0),
         crossing_speed=jnp.where(landed, -pick(before.slopes, before.guard), 0.0),
     )
 

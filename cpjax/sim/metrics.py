@@ -46,7 +46,7 @@ class Sample(NamedTuple):
     """Bits of `Flag`."""
     crossing: jax.Array
     """What was located here, int32: 0 nothing, 1 and 2 the upper and the lower end of the supply, 3 the gate; events of
-    the plant's own from 4 on, or from 1 on on the sampled clock."""
+    the plant's own from 4 on."""
     crossing_speed: jax.Array
     """How fast that guard fell [1/s]: of the voltage relative to the limit, or of the gate's margin. 0 elsewhere."""
 

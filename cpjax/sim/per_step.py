@@ -15,6 +15,7 @@ from jax.extend.core import Literal
 
 from cpjax import runtime
 from cpjax.compilation import one_function, part_of_step
+from cpjax.pytree import cast
 from cpjax.returned import call, like
 from cpjax.sim import failures, plants
 from cpjax.sim.control import Control, start_control, update_control
@@ -56,7 +57,7 @@ def simulate(
     loop = _Loop(start, control, flag, jnp.zeros_like(flag))
     _, first, _ = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
 
-    carry = (loop, call("metrics", fold, "init", first))
+    carry = (loop, start_metric(fold, first))
     run = one_function(functools.partial(_run, settings=settings), stacks=True)
     (loop, memory), samples = run(carry, plant, controller, fold, dt)
     after, last, _ = _observe(plant, controller, loop, jnp.asarray(settings.steps), dt, settings)
@@ -64,7 +65,7 @@ def simulate(
     memory = _fold(
         fold, memory, clean, plant, loop.control, after.control, jnp.asarray(settings.steps), settings, update_metric
     )
-    return samples, _saved(last, after), fold.finish(memory, clean)
+    return samples, _saved(plant, last, after), call("metrics", fold, "finish", memory, clean)
 
 
 def _run(
@@ -79,13 +80,13 @@ def _run(
         memory = _fold(
             fold, memory, sample, plant, before.control, loop.control, index, settings, part_of_step(update_metric)
         )
-        saved = pack(_saved(sample, loop)) if every == 1 else None
+        saved = pack(_saved(plant, sample, loop)) if every == 1 else None
         return (_advance(plant, controller, loop, instant, dt, settings), memory), saved
 
     def block(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], jax.Array]:
         loop, sample, _ = _observe(plant, controller, carry[0], index, dt, settings)
         carry, _ = scan(body, carry, index + jnp.arange(every), "every_step")
-        return carry, pack(_saved(sample, loop))
+        return carry, pack(_saved(plant, sample, loop))
 
     if every is None:
         # With these options of the compiler, all that is remembered would be copied at each step.
@@ -108,26 +109,32 @@ def _fold(
     update: Callable[..., Any],
 ) -> Any:
     """Returns the metric's memory after a sample, with the derivative of the mean if that is asked for."""
-    new = like("metrics.update", update(fold, memory, sample), memory)
+    new = update(fold, memory, sample)
     if now.blend is None or before.blend is None or not sees_the_voltage(fold, memory, sample):
         return new
     # A metric need not be linear in the voltage. So it is computed with the other voltage too: with that of the period
     # before, which is still applied unless this is a control instant, and with that of the period that begins.
     instant = index % settings.steps_per_control == 0
-    since = sample._replace(voltage_since=before.blend.held, voltage=jnp.where(instant, sample.voltage, now.blend.held))
+    since = sample._replace(
+        voltage_since=before.blend.held,
+        voltage=jnp.where(instant, sample.voltage, now.blend.held),
+        mode_before=jnp.where(instant, before.blend.mode, now.blend.mode),
+        mode=jnp.where(instant, sample.mode, now.blend.mode),
+    )
     result = shifted(new, update(fold, memory, _completed(plant, since)), before.blend.shift)
-    begun = sample._replace(voltage=now.blend.held)
+    begun = sample._replace(voltage=now.blend.held, mode=now.blend.mode)
     return shifted(result, update(fold, memory, _completed(plant, begun)), jnp.where(instant, now.blend.shift, 0.0))
 
 
 def sees_the_voltage(fold: Fold, memory: Any, sample: Sample) -> bool:
-    """Whether a metric's update may depend on the voltage, or on what the plant keeps because of it."""
+    """Whether a metric's update may depend on the voltage or the mode, or on what the plant keeps because of it."""
 
     def update(voltages: Any) -> Any:
-        voltage, since, outputs = voltages
-        return update_metric(fold, memory, sample._replace(voltage=voltage, voltage_since=since, outputs=outputs))
+        names = ("voltage", "voltage_since", "outputs", "mode", "mode_before")
+        return update_metric(fold, memory, sample._replace(**dict(zip(names, voltages, strict=True))))
 
-    jaxpr = jax.make_jaxpr(update)((sample.voltage, sample.voltage_since, sample.outputs)).jaxpr
+    given = sample.voltage, sample.voltage_since, sample.outputs, sample.mode, sample.mode_before
+    jaxpr = jax.make_jaxpr(update)(given).jaxpr
     reached = set(jaxpr.invars)
     for equation in jaxpr.eqns:
         if any(not isinstance(v, Literal) and v in reached for v in equation.invars):
@@ -142,14 +149,20 @@ def _completed(plant: Plant, sample: Sample) -> Sample:
     return sample._replace(outputs=plants.outputs(plant, sample.state, acceleration, sample.voltage))
 
 
-def _saved(sample: Sample, loop: _Loop) -> Sample:
+def _saved(plant: Plant, sample: Sample, loop: _Loop) -> Sample:
     """Returns a sample as it is saved: its voltage has the derivative that the plant sees."""
-    return sample if loop.control.blend is None else sample._replace(voltage=loop.control.applied)
+    return sample if loop.control.blend is None else _completed(plant, sample._replace(voltage=loop.control.applied))
 
 
 def update_metric(fold: Fold, memory: Any, sample: Sample) -> Any:
     """Returns a metric's memory after a sample."""
-    return call("metrics", fold, "update", memory, sample)
+    updated = cast(call("metrics", fold, "update", memory, sample), sample.time.dtype)
+    return like("metrics.update", updated, memory)
+
+
+def start_metric(fold: Fold, first: Sample) -> Any:
+    """Returns a metric's memory before its first update, in the rollout's dtype."""
+    return jax.tree.map(jnp.asarray, cast(call("metrics", fold, "init", first), first.time.dtype))
 
 
 def _observe(

@@ -98,12 +98,15 @@ def check_plant(plant: Any) -> None:
     """Checks that a plant has all that the loop asks for.
 
     Raises:
-      InputError: a method is missing, or `limits` and `coordinates` do not fit each other.
+      InputError: a method is missing, also of those that belong together.
     """
     needed = ("limits", "coordinates", "state", "saturate", "accelerations")
     missing = [name for name in needed if not hasattr(plant, name)]
     if missing or isinstance(plant, type):
         raise InputError("plant", plant, f"a cpjax.CartPole, or a plant of your own with {', '.join(needed)}")
+    for together in (("geometry", "geometry_near"), ("start_mode", "guards", "jump")):
+        if 0 < sum(hasattr(plant, name) for name in together) < len(together):
+            raise InputError("plant", plant, f"one with all of {', '.join(together)}, or none of them")
 
 
 def coordinates(plant: Plant, state: Tree) -> tuple[Tree, Tree]:
@@ -113,7 +116,11 @@ def coordinates(plant: Plant, state: Tree) -> tuple[Tree, Tree]:
 
 def state_of(plant: Plant, q: Tree, v: Tree) -> Tree:
     """Returns the state of (q, v)."""
-    return call("plant", plant, "state", q, v)
+    state = call("plant", plant, "state", q, v)
+    found: Any = jax.tree.structure(state)
+    if found != jax.tree.structure(plant.limits):
+        raise InputError("plant.state", str(found), "a state of the structure of plant.limits")
+    return state
 
 
 def geometry(plant: Plant, q: Tree) -> Tree:
@@ -139,12 +146,23 @@ def saturate(plant: Plant, command: jax.Array) -> jax.Array:
 
 def start_mode(plant: Plant, q: Tree, v: Tree) -> Tree:
     """Returns the plant's own mode at the start; () for a plant without modes."""
-    return call("plant", plant, "start_mode", q, v) if has_events(plant) else ()
+    return jax.tree.map(jnp.asarray, call("plant", plant, "start_mode", q, v)) if has_events(plant) else ()
 
 
 def outputs(plant: Plant, state: Tree, acceleration: Tree, u: Scalar) -> dict[str, Any]:
     """Returns what the plant wants kept of a sample beside state and input, by name; nothing by default."""
-    return dict(plant.outputs(state, acceleration, u)) if hasattr(plant, "outputs") else {}
+    if not hasattr(plant, "outputs"):
+        return {}
+    found = call("plant", plant, "outputs", state, acceleration, u)
+    if not isinstance(found, dict) or not _TAKEN.isdisjoint(found):
+        allowed = f"a dict of scalars by name, other names than {', '.join(sorted(_TAKEN))}"
+        raise InputError("plant.outputs", found, allowed)
+    dtype = jnp.asarray(jax.tree.leaves(state)[0]).dtype
+    return {name: real(f"plant.outputs: {name}", value, dtype) for name, value in found.items()}
+
+
+_TAKEN = frozenset({"time", "state", "voltage", "mode", "flag", "metrics", "outputs"})
+"""Names of a trajectory's own columns."""
 
 
 def within(tree: Tree, limits: Tree) -> jax.Array:

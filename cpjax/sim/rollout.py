@@ -12,7 +12,15 @@ import jax
 import numpy as np
 
 from cpjax.controllers.feedback import StateFeedback
-from cpjax.controllers.protocol import Controller, Law, ModalController, SmoothController, as_controller, at_period
+from cpjax.controllers.protocol import (
+    Controller,
+    Law,
+    ModalController,
+    SmoothController,
+    as_controller,
+    at_period,
+    is_clocked,
+)
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.pytree import as_arguments, check, pytree, reveal
@@ -128,6 +136,8 @@ def prepared(
     if settings.clock == "continuous" and not isinstance(controller, ModalController):
         allowed = "sampled: a controller with memory is updated once per control period"
         raise InputError("clock", settings.clock, allowed)
+    if settings.clock == "continuous" and is_clocked(controller):
+        raise InputError("clock", settings.clock, "sampled: a part of the controller depends on the control period")
     if settings.clock == "continuous" and settings.switching == "located":
         if not isinstance(controller, SmoothController):
             raise InputError("controller", controller, "one with margin and successor, for located switching")
@@ -136,7 +146,7 @@ def prepared(
     if metrics is None:
         if not isinstance(plant, CartPole) and settings.save_every is None:
             raise InputError("metrics", None, "given: the default ProtocolMetrics() are those of a cpjax.CartPole")
-        metrics = ProtocolMetrics() if isinstance(plant, CartPole) else NoMetrics()
+        metrics = default_metrics(plant)
     folds = all(callable(getattr(metrics, name, None)) for name in ("init", "update", "finish"))
     if isinstance(metrics, type) or not folds:
         raise InputError("metrics", metrics, "a metric with init, update and finish, such as cpjax.ProtocolMetrics()")
@@ -145,6 +155,11 @@ def prepared(
     plant, controller, metrics = (as_arguments(name, part, dtype) for name, part in parts)
     dt = np.asarray(simulation["dt"], dtype=dtype)
     return start, (plant, controller, metrics, dt), settings, [*each, False]
+
+
+def default_metrics(plant: Any) -> Fold:
+    """Returns the metric of a rollout that is given none: the protocol's for a `CartPole`, nothing for other plants."""
+    return ProtocolMetrics() if isinstance(plant, CartPole) else NoMetrics()
 
 
 @functools.partial(jax.jit, static_argnames="settings")
@@ -165,7 +180,7 @@ def simulate(
     if settings.clock == "sampled":
         controller = at_period(controller, dt * settings.steps_per_control)
     blind = settings.switching == "per_step" or settings.clock == "sampled"
-    if blind and settings.derivative is None and may_switch(controller):
+    if blind and settings.derivative is None and may_switch(controller, start):
         start, plant, controller = watched((start, plant, controller))
     one = located.simulate if settings.switching == "located" else per_step.simulate
     packed, last, result = one(start, plant, controller, fold, dt, settings)

@@ -15,7 +15,7 @@ from cpjax.sim.plants import Plant, Tree
 
 def applied_voltage(plant: Plant, controller: ModalController, state: Tree, mode: jax.Array) -> jax.Array:
     """Returns what the plant gets: the law's demand in `mode`, in the state's dtype, clipped by the drive."""
-    return plants.saturate(plant, part_of_step(demand)(controller, state, mode).astype(dtype_of(state)))
+    return plants.saturate(plant, part_of_step(demand)(controller, state, mode))
 
 
 def dtype_of(tree: Tree) -> Any:

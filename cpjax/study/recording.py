@@ -3,6 +3,7 @@
 import hashlib
 import io as buffers
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Unpack
@@ -14,8 +15,9 @@ from jax.experimental import multihost_utils
 from cpjax import io
 from cpjax.controllers.protocol import Controller, Law, ModalController, as_controller
 from cpjax.errors import InputError
-from cpjax.sim.metrics import Fold, ProtocolMetrics
+from cpjax.sim.metrics import Fold
 from cpjax.sim.plants import Plant
+from cpjax.sim.rollout import default_metrics
 from cpjax.sim.settings import Simulation, check_names
 from cpjax.sim.sweep import Progress, Work, prepare
 
@@ -73,7 +75,7 @@ def record_sweep(
         "dtype": str(work.leaves[0].dtype),
         "plant": _described(plant),
         "controller": _described(as_controller(controller)),
-        "metrics": _described(ProtocolMetrics() if metrics is None else metrics),
+        "metrics": _described(default_metrics(plant) if metrics is None else metrics),
     }
     folder = path if save_every else path.with_name(path.name + ".parts")
     first = jax.process_index() == 0
@@ -144,14 +146,21 @@ def _pyarrow() -> Any:
 
 
 def _described(component: Any) -> Any:
-    return io.encode(component) if type(component) in io.TYPES.values() else type(component).__name__
+    try:
+        return io.encode(component)
+    except InputError:  # a user's own, or one that holds some
+        return type(component).__name__
 
 
 def _digest(work: Work) -> str:
-    """A fingerprint of all numbers that go in."""
+    """Returns a fingerprint of all that goes in."""
     digest = hashlib.sha256()
+    # With classes, choices and functions; without addresses, which are others in each process.
+    digest.update(re.sub(r" at 0x[0-9a-f]+", "", str(work.kind.structure)).encode())
     for leaf in work.leaves:
-        digest.update(np.ascontiguousarray(leaf).tobytes())
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{array.shape} {array.dtype}".encode())
+        digest.update(array.tobytes())
     return digest.hexdigest()
 
 
