@@ -156,3 +156,62 @@ def test_a_quantiser_has_the_derivative_that_its_name_says():
     assert float(jnp.mean(mean(x + 0.03) - mean(x))) == pytest.approx(0.03, rel=0.02)
     with pytest.raises(cpjax.InputError, match=r"derivative = 'one': must be zero or straight_through"):
         cpjax.quantize(0.1, 0.1, derivative="one")
+
+
+def test_the_gradient_of_a_mean_is_the_mean_of_the_gradients_under_vmap_and_in_a_sweep():
+    starts = catching(6, 6)
+    settings = {"duration": 0.8, "dt": 0.002, "derivative": "mean", "metrics": cpjax.TimeOutside()}
+    each = derivatives(starts, duration=0.8, dt=0.002, derivative="mean")
+
+    def mapped(p):
+        return jnp.mean(jax.vmap(lambda start: cpjax.measure(PLANT, changed(p), start, **settings))(starts))
+
+    def swept(p):
+        return jnp.mean(cpjax.sweep(PLANT, changed(p), starts, **settings))
+
+    for function in (mapped, swept):
+        np.testing.assert_allclose(jax.grad(function)(P), each.mean(0), rtol=1e-9)
+    np.testing.assert_allclose(jax.jacfwd(mapped)(P), each.mean(0), rtol=1e-9)
+
+
+@cpjax.pytree.pytree
+class Looking:
+    """Holds a hybrid, looks into its gate, and keeps None in its memory."""
+
+    controller: cpjax.Hybrid
+
+    def init(self, measurement):
+        return {"inner": self.controller.init(measurement), "spare": None, "margin": 0.0}
+
+    def update(self, memory, measurement):
+        inner, command = self.controller.update(memory["inner"], measurement)
+        margin = self.controller.gate.margin(measurement, inner.mode)
+        return {"inner": inner, "spare": None, "margin": margin}, command
+
+
+def test_a_controller_that_looks_into_the_one_it_holds_has_the_same_derivative():
+    starts = catching(4, 7)
+    plain = derivatives(starts, derivative="mean", dt=0.002)
+    np.testing.assert_allclose(derivatives(starts, Looking, derivative="mean", dt=0.002), plain, rtol=1e-9)
+
+
+@cpjax.pytree.pytree
+class TimeSwingingUp:
+    """The time in mode 0 [s], which only the moment of the switch decides."""
+
+    def init(self, sample):
+        return jnp.zeros_like(sample.time)
+
+    def update(self, memory, sample):
+        return memory + jnp.where(sample.mode_before == 0, sample.elapsed, 0.0)
+
+    def finish(self, memory, last):
+        return memory
+
+
+def test_a_metric_of_the_mode_has_the_derivative_of_its_mean():
+    found = derivatives(catching(4_000, 4), metrics=TimeSwingingUp(), derivative="mean", dt=0.002)
+    expected, error = differences(2, lambda controller: controller, TimeSwingingUp())
+    error = math.hypot(error, found[:, 2].std() / math.sqrt(4_000))
+    assert abs(expected) > 20.0 * error
+    assert abs(found[:, 2].mean() - expected) <= 3.0 * error

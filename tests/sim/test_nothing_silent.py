@@ -337,3 +337,60 @@ class HiddenModes:
 def test_a_mode_whose_margin_cannot_be_seen_is_refused_by_the_derivative_of_the_mean():
     with pytest.raises(cpjax.InputError, match=r"derivative = 'mean': must be pathwise: a part of this controller"):
         cpjax.measure(PLANT, HiddenModes(), cpjax.HANGING, derivative="mean", **RUN)
+
+
+@pytree
+class Filter:
+    """Remembers the period that it was told."""
+
+    inner: object = None
+    period: object = 1.0
+
+    def at_period(self, period):
+        return dataclasses.replace(self, period=period)
+
+    def init(self, measurement):
+        return ()
+
+    def update(self, memory, measurement):
+        return (), jnp.asarray(self.period) + (0.0 if self.inner is None else self.inner.update((), measurement)[1])
+
+
+def test_every_part_of_a_controller_is_told_the_period():
+    run = cpjax.rollout(PLANT, Filter(Filter()), cpjax.HANGING, duration=0.1, dt=0.002, control_period=0.01)
+    np.testing.assert_allclose(run.voltage, 0.02)
+    with pytest.raises(cpjax.InputError, match="clock = 'continuous'"):
+        cpjax.rollout(PLANT, Filter(), cpjax.HANGING, duration=0.1, dt=0.002, clock="continuous")
+
+
+class HalfEventful(cpjax.CartPole):
+    """Has guards, and nothing that a guard leads to."""
+
+    def guards(self, q, v, u, mode):
+        return (1.0 - q[0],)
+
+
+def test_a_plant_with_half_of_a_protocol_is_refused():
+    with pytest.raises(cpjax.InputError, match="one with all of start_mode, guards, jump, or none of them"):
+        cpjax.rollout(HalfEventful(), CENTRED, cpjax.HANGING, **RUN)
+
+
+@pytree
+class Bang:
+    """A controller with modes and no margin."""
+
+    edge: float = 1.0
+
+    def start_mode(self, state):
+        return self.next_mode(state, 0)
+
+    def next_mode(self, state, mode):
+        return (state.x > self.edge).astype(jnp.int32)
+
+    def mode_voltage(self, state, mode):
+        return jnp.where(mode == 1, -1.0, 1.0)
+
+
+def test_a_mode_without_a_margin_warns_too():
+    with pytest.warns(cpjax.DerivativeWarning):
+        jax.grad(lambda edge: cpjax.measure(PLANT, Bang(edge), cpjax.HANGING, **RUN).effort)(0.1)

@@ -9,6 +9,7 @@ import time
 import jax
 import numpy as np
 import pytest
+from extensions import dead_time
 
 import cpjax
 from cpjax import InputError, io, paper, read_sweep, record_sweep
@@ -192,3 +193,21 @@ def test_two_processes_write_the_file_that_one_writes(tmp_path):
     for processes in ([begin(one, "alone")], [begin(two, str(i), address) for i in range(2)]):
         assert [process.wait(timeout=120) for process in processes] == [0] * len(processes)
     assert one.read_bytes() == two.read_bytes()
+
+
+def test_a_controller_of_ones_own_is_recorded_and_its_choices_tell_two_sweeps_apart(tmp_path):
+    starts = cpjax.sample_starts("hanging", 64, seed=1)
+
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    settings = {"duration": 0.1, "dt": 0.002, "block": 16}
+    path = tmp_path / "sweep.npz"
+    with pytest.raises(KeyboardInterrupt):
+        cpjax.record_sweep(path, PLANT, dead_time.example()[0], starts, progress=stop, **settings)
+    longer = dead_time.DeadTime(dead_time.example()[0].controller, 12.0, 40)
+    with pytest.raises(cpjax.InputError, match="parts of other work"):
+        cpjax.record_sweep(path, PLANT, longer, starts, **settings)
+    found = cpjax.record_sweep(path, PLANT, dead_time.example()[0], starts, **settings)
+    assert found.effort.shape == (64,)
+    assert cpjax.read_sweep(path)[0]["controller"] == "DeadTime"
