@@ -35,6 +35,8 @@ def objective(switching: Any, checkpoint: Any, duration: float) -> Callable[[Map
             cpjax.EnergySwingUp(plant, **numbers), cpjax.StateFeedback(p["K"][None]), cpjax.AngleGate(p["half_angle"])
         )
         settings: dict[str, Any] = {"switching": switching, "checkpoint": checkpoint}
+        if switching == "per_step":
+            settings["derivative"] = "pathwise"  # its cost is what is asked for here
         found: jax.Array = cpjax.measure(
             plant, law, start, clock="continuous", duration=duration, dt=DT, metrics=cpjax.TimeOutside(), **settings
         )

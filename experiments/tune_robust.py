@@ -83,7 +83,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
 
 def _evaluated(controller: Hybrid, plants: CartPole, starts: State, **settings: Any) -> Metrics:
     def one(plant: CartPole, start: State) -> Metrics:
-        found: Metrics = measure(plant, controller, start, clock="continuous", duration=20.0, dt=0.002, **settings)
+        found: Metrics = measure(plant, controller, start, duration=20.0, dt=0.002, **settings)
         return found
 
     found: Metrics = jax.vmap(one)(jax.tree.map(jnp.asarray, plants), jax.tree.map(jnp.asarray, starts))

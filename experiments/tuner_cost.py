@@ -97,9 +97,7 @@ def _measure(design: Any, work: str, quick: bool) -> float:
     def outside(vector: jax.Array, start: State) -> jax.Array:
         fold = TimeOutside(0.1, 0.1)
         settings: dict[str, Any] = {"switching": "located", "spare_steps": plan.spare_steps}
-        found: jax.Array = measure(
-            plant, free.build(vector), start, clock="continuous", duration=duration, dt=dt, metrics=fold, **settings
-        )
+        found: jax.Array = measure(plant, free.build(vector), start, duration=duration, dt=dt, metrics=fold, **settings)
         return found
 
     function: Any = value if work == "values" else jax.value_and_grad(outside)

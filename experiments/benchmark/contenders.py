@@ -71,7 +71,7 @@ def cpjax_gradient(task: Task, reverse: bool = True, checkpoint: Any = "segments
     plant, controller = problem()
 
     def cost(controller: Any, starts: Any, steps: int) -> Any:
-        options = settings(steps) | {"checkpoint": checkpoint}
+        options = settings(steps) | {"checkpoint": checkpoint, "derivative": "pathwise"}
         metrics = jax.vmap(lambda start: cpjax.measure(plant, controller, start, **options))(starts)
         return metrics.effort.mean(), metrics.cart_travel
 
