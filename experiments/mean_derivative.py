@@ -13,9 +13,13 @@ Every derivative is of the time outside the target over 3 s, relative to a whole
    its standard error, beside the mean of derivative="mean" and of derivative="pathwise".
 3. Flux: the same over a tenth as many of the sets `hanging` and `anywhere`, where a moved parameter also moves initial
    states from one course to another: the share of the mean's change that no pathwise derivative sees.
+4. Cost: reverse mode in the parameters that are no part of the regulator, with derivative="mean" and
+   "pathwise", timed in turn.
 """
 
-from collections.abc import Callable
+import functools
+import time
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +39,8 @@ PERIODS = (4e-3, 2e-3, 1e-3, 5e-4)
 CENTRE = (0.03, 0.0, np.pi - 0.5, -0.5)
 """About which all initial states change their mode equally often."""
 WIDTH = 0.05
+UNDESIGNED = ("energy_gain", "cart_stiffness", "cart_damping", "half_angle", "rate")
+"""Parameters that are no part of the regulator, whose design would take its own time."""
 MOVE = 1e-3
 """By which share of itself a parameter is moved for differences."""
 
@@ -59,14 +65,12 @@ class Counted:
 class Loop:
     """A controller as a function of its named numbers, each in units of a whole change."""
 
-    def __init__(self, controller: cpjax.Hybrid) -> None:
+    def __init__(
+        self, controller: cpjax.Hybrid, names: Collection[str] = (*UNDESIGNED, "Q", "polynomial", "K")
+    ) -> None:
         self.plant = paper.appendix_plant()
         chosen = parametrise(self.plant, controller)
-        mine = {
-            name: value
-            for name, value in chosen.parameters.items()
-            if name in ("energy_gain", "cart_stiffness", "cart_damping", "half_angle", "rate", "Q", "polynomial", "K")
-        }
+        mine = {name: value for name, value in chosen.parameters.items() if name in names}
         rest = {name: jnp.asarray(value) for name, value in chosen.parameters.items() if name not in mine}
         self.names, values, shapes = as_matrix(mine, 1, each=False)
         self.values, self.shapes = jnp.asarray(values[0]), shapes
@@ -76,16 +80,18 @@ class Loop:
         """Returns the controller with each number moved by a share of itself (d,)."""
         return self.built(as_tree(self.values * (1.0 + moves), self.shapes))[1]
 
+    @functools.cache  # noqa: B019  # so that the same settings are compiled once
+    def _objective(self, **settings: Any) -> Callable[[jax.Array, cpjax.State], Any]:
+        def outside(moves: jax.Array, start: cpjax.State) -> Any:
+            moved = self.controller(moves)
+            return cpjax.measure(self.plant, moved, start, metrics=cpjax.TimeOutside(), duration=DURATION, **settings)
+
+        return outside
+
     def gradient(self, starts: cpjax.State, chunk: int = 64, **settings: Any) -> np.ndarray:
         """Returns derivatives of single runs (n, d)."""
-
-        def outside(moves: jax.Array, start: cpjax.State) -> jax.Array:
-            found: jax.Array = cpjax.measure(
-                self.plant, self.controller(moves), start, metrics=cpjax.TimeOutside(), duration=DURATION, **settings
-            )
-            return found
-
-        return np.asarray(cpjax.gradients(outside, jnp.zeros(len(self.names)), starts, chunk=chunk).gradient)
+        objective = self._objective(**settings)
+        return np.asarray(cpjax.gradients(objective, jnp.zeros(len(self.names)), starts, chunk=chunk).gradient)
 
     def values_at(self, moves: np.ndarray, starts: cpjax.State, **settings: Any) -> tuple[np.ndarray, np.ndarray]:
         """Returns the time outside (n,) and the number of mode changes (n,)."""
@@ -94,6 +100,19 @@ class Loop:
             self.plant, self.controller(jnp.asarray(moves)), starts, metrics=Counted(), **settings
         )
         return np.asarray(value), np.asarray(changes)
+
+
+def cost_row(name: str, controller: cpjax.Hybrid, count: int, laps: int, seed: int) -> dict[str, Any]:
+    """Times both derivatives in turn and returns the median ratio."""
+    loop, starts = Loop(controller, UNDESIGNED), cpjax.sample_starts("hanging", count, seed=seed)
+    seconds: dict[str, list[float]] = {"mean": [], "pathwise": []}
+    for lap in range(laps + 1):
+        for kind in seconds:
+            before = time.perf_counter()
+            loop.gradient(starts, derivative=kind, dt=DT)
+            if lap:  # The first one compiles.
+                seconds[kind].append(time.perf_counter() - before)
+    return {"controller": name, "ratio": float(np.median(np.divide(seconds["mean"], seconds["pathwise"])))}
 
 
 def about_the_centre(count: int, seed: int) -> cpjax.State:
@@ -173,9 +192,11 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
         "tuned, placement": cpjax.preset("placement"),
     }
     few, many, gradients = (8, 64, 4) if quick else (256, 1_000_000, 100_000)
-    found: dict[str, list[dict[str, Any]]] = {"order": [], "mean": [], "flux": []}
+    found: dict[str, list[dict[str, Any]]] = {"cost": [], "order": [], "mean": [], "flux": []}
     for name, controller in controllers.items():
         loop = Loop(controller)
+        found["cost"].append(cost_row(name, controller, few, 2 if quick else 15, seed))
+        print(f"{name}: the derivative of the mean takes {found['cost'][-1]['ratio']:.2f} times plain reverse mode")
         found["order"] += order_rows(name, loop, few, seed)
         found["mean"] += mean_rows(name, loop, "box", about_the_centre(many, seed), gradients, MOVE)
         for of in ("hanging", "anywhere"):
@@ -215,5 +236,5 @@ def show(name: str, found: dict[str, list[dict[str, Any]]]) -> None:
 
 
 if __name__ == "__main__":
-    cpjax.configure_cpu()
+    cpjax.configure_cpu(gradients=True)
     run(main, __doc__.splitlines()[0])

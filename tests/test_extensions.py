@@ -143,7 +143,7 @@ def test_a_pid_is_that_of_an_independent_loop_within_1e_9_over_2_s():
     run = cpjax.rollout(PLANT, law, start, duration=2.0, dt=0.0005, control_period=0.002, save_every=4)
     assert np.max(np.abs(columns(run.state) - states)) <= 1e-9
     assert np.max(np.abs(np.asarray(run.voltage) - voltages)) <= 1e-7  # 1e-9 of the angle, through the D term
-    assert np.max(np.abs(voltages)) == 12.0 or np.max(np.abs(voltages)) > 1.0
+    assert np.max(np.abs(voltages)) == 12.0  # so that the anti-windup acts
 
 
 def test_the_integral_of_a_pid_does_not_wind_up_while_its_command_is_clipped():
@@ -152,13 +152,15 @@ def test_the_integral_of_a_pid_does_not_wind_up_while_its_command_is_clipped():
     free = dataclasses.replace(law, tracking=1e9)
     plant = cpjax.CartPole(motor=cpjax.Motor(voltage_limit=12.0))
 
-    def integral(law):
-        memory = law.init(far)
-        for _ in range(500):
+    def integrals(law):
+        memory, found = law.init(far), []
+        for _ in range(2000):
             memory, _ = law.update(memory, far)
-        return abs(float(memory.integral))
+            found.append(float(memory.integral))
+        return found[999], found[1999]
 
-    assert integral(law) < 0.1 * integral(free) or integral(law) < 2.0
+    assert integrals(law)[1] == pytest.approx(integrals(law)[0], rel=1e-3)
+    assert integrals(free)[1] == pytest.approx(2.0 * integrals(free)[0], rel=1e-3)
     assert int(cpjax.measure(plant, law, far, **RUN).flag) == 0
 
 

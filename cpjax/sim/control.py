@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from cpjax.controllers.protocol import ModeMemory, as_sampled, modes_in, start_memory
 from cpjax.pytree import cast
@@ -80,14 +81,15 @@ def update_control(plant: Plant, controller: Any, before: Control, state: Tree, 
         return Control(memory, plants.saturate(plant, command))
     updated, command = _updated(as_sampled(tracked(controller)), memory, state)
     unchanged, other = _updated(as_sampled(holding(controller)), memory, state)
-    voltage, held = plants.saturate(plant, command), plants.saturate(plant, other)
+    # Of the other command the derivative takes the value alone; what it does not need is not carried along.
+    voltage, held = plants.saturate(plant, command), lax.stop_gradient(plants.saturate(plant, other))
     shift = shift_of(updated).astype(voltage.dtype)
     nothing = jnp.zeros_like(voltage)
     echo = nothing
     if before.blend is not None:
         updated = with_zeros(updated, before.blend.memory_echo)
-        echo = shifted(nothing, before.blend.held - before.voltage, -0.5 * before.blend.shift)
-    gap = difference(unchanged, updated)
+        echo = shifted(nothing, lax.stop_gradient(before.blend.held - before.voltage), -0.5 * before.blend.shift)
+    gap = lax.stop_gradient(difference(unchanged, updated))
     zeros = jax.tree.map(jnp.zeros_like, gap)
     memory = with_zeros(updated, shifted(zeros, gap, 1.5 * shift))
     return Control(memory, voltage, Blend(held, shift, echo, shifted(zeros, gap, -0.5 * shift), before.mode))

@@ -31,7 +31,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import (
@@ -73,8 +72,7 @@ class Tracked:
         before, after = memory.margin, _margin(self.controller, measurement, memory.mode)
         assert before is not None
         crossed = (mode != memory.mode) & (before > 0.0) & (after < 0.0)
-        fraction = before / jnp.where(crossed, before - after, 1.0)
-        shift = jnp.where(crossed, fraction - lax.stop_gradient(fraction), 0.0)
+        shift = _moved_crossing(before, after, crossed)
         margin = _margin(self.controller, measurement, mode)
         return ModeMemory(mode, margin, shift), demand(self.controller, measurement, mode)
 
@@ -121,14 +119,29 @@ def shift_of(memory: Any) -> jax.Array:
 
 
 @jax.custom_jvp
+def _moved_crossing(before: jax.Array, after: jax.Array, crossed: jax.Array) -> jax.Array:
+    """Returns 0, with the derivative of `before / (before - after)` where a crossing is, which is where in the period
+    between two margins the crossing is."""
+    return jnp.where(crossed, jnp.zeros_like(before), jnp.zeros_like(before))
+
+
+@_moved_crossing.defjvp
+def _moved_crossing_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    before, after, crossed = primals
+    d_before, d_after, _ = tangents
+    over = jnp.where(crossed, 1.0 / jnp.where(crossed, before - after, 1.0) ** 2, 0.0)
+    return _moved_crossing(*primals), over * (before * d_after - after * d_before)
+
+
+@jax.custom_jvp
 def shifted(new: Any, old: Any, shift: jax.Array) -> Any:
     """Returns `new`, whose derivative is also that of replacing it by `old` to the share `shift`, which is 0.
 
     Args:
       new, old: trees of one structure.
     """
-    # Always `new`; written so that under vmap the value is a batch wherever its derivative is one.
-    return jax.tree.map(lambda a, b: jnp.where(shift == 0.0, a, b), new, old)
+    # Written as a choice so that under vmap the value is a batch wherever its derivative is one.
+    return jax.tree.map(lambda a: jnp.where(shift == 0.0, a, a), new)
 
 
 @shifted.defjvp
@@ -139,10 +152,22 @@ def _shifted_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     def moved(new: jax.Array, old: jax.Array, tangent: Any) -> Any:
         if not jnp.issubdtype(jnp.asarray(new).dtype, jnp.floating):
             return tangent
-        jump = old - new  # of two infinities, such as a settling time that is not known yet, it is NaN
+        jump = _once(old - new)  # of two infinities, such as a settling time that is not known yet, it is NaN
         return tangent + jnp.where(jnp.isfinite(jump), jump, 0.0) * d_shift
 
     return shifted(new, old, shift), jax.tree.map(moved, new, old, d_new)
+
+
+@jax.custom_jvp
+def _once(jump: jax.Array) -> jax.Array:
+    """Returns its argument, which must not be differentiated again."""
+    return jump
+
+
+@_once.defjvp
+def _once_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    allowed = "first derivatives only. For second derivatives ask for switching='located', on the continuous clock"
+    raise InputError("derivative", "mean", allowed)
 
 
 def difference(held: Any, updated: Any) -> tuple[jax.Array, ...]:

@@ -114,7 +114,7 @@ def _fold(
         return new
     # A metric need not be linear in the voltage. So it is computed with the other voltage too: with that of the period
     # before, which is still applied unless this is a control instant, and with that of the period that begins.
-    instant = index % settings.steps_per_control == 0
+    instant = index % settings.steps_per_control == 0 if settings.steps_per_control > 1 else np.bool_(True)
     since = sample._replace(
         voltage_since=before.blend.held,
         voltage=jnp.where(instant, sample.voltage, now.blend.held),

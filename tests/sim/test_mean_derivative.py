@@ -48,14 +48,19 @@ def test_all_of_these_cross_once():
     assert set(np.asarray(swept.switches).tolist()) == {1}
 
 
-@pytest.mark.parametrize("wrapped", [False, True], ids=["hybrid", "held in another controller"])
-def test_its_error_in_single_runs_falls_with_the_period(wrapped):
+@pytest.mark.parametrize(
+    ("wrapped", "steps"),
+    [(False, 1), (True, 1), (False, 2)],
+    ids=["hybrid", "held in another controller", "two steps per control period"],
+)
+def test_its_error_in_single_runs_falls_with_the_period(wrapped, steps):
     starts = catching(48, 2)
     exact = derivatives(starts, switching="located", dt=1e-3)
     periods = np.array([4e-3, 2e-3, 1e-3])
     wrap = Passing if wrapped else (lambda controller: controller)
     errors = [
-        np.median(np.abs(derivatives(starts, wrap, derivative="mean", dt=float(dt)) - exact), 0) for dt in periods
+        np.median(np.abs(derivatives(starts, wrap, derivative="mean", dt=t / steps, control_period=t) - exact), 0)
+        for t in periods.tolist()
     ]
     for i in range(3):
         assert fitted_order(periods, np.array([row[i] for row in errors])) > 0.8
@@ -144,6 +149,19 @@ def test_values_are_those_of_the_plain_loop_and_float32_works():
     np.testing.assert_allclose(found.effort, plain.effort, rtol=1e-5)
     slopes = derivatives(starts, derivative="mean", dt=0.002, duration=0.8)
     assert np.all(np.isfinite(slopes))
+
+
+def test_a_second_derivative_of_the_mean_is_refused():
+    def outside(gain):
+        p = jnp.stack([gain, P[1], P[2]])
+        start = cpjax.State(0.0, 0.0, 1.2, -2.0)
+        return cpjax.measure(
+            PLANT, changed(p), start, metrics=cpjax.TimeOutside(), duration=0.1, dt=0.002, derivative="mean"
+        )
+
+    for second in (jax.jacfwd(jax.grad(outside)), jax.jacrev(jax.jacrev(outside))):
+        with pytest.raises(cpjax.InputError, match=r"derivative = 'mean': must be first derivatives only\. .*located"):
+            second(P[0])
 
 
 def test_a_quantiser_has_the_derivative_that_its_name_says():
