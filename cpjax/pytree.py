@@ -249,7 +249,8 @@ def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
     """Refuses a component that no rollout can run: JAX may have rebuilt it with anything.
 
     Fields with a declared rule, and those annotated as `Scalar`, are held against it. All else that a component of a
-    user's own holds (arrays of any shape, trees of them, functions) is taken as it is.
+    user's own holds (arrays of any shape, trees of them, functions) is taken as it is; of random keys
+    (`jax.random.key`) there may be one for each start.
 
     Args:
       batch: how many components the tree may hold: declared fields may have a leading axis of this length.
@@ -269,7 +270,7 @@ def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
         if is_component(node):
             batched += _check_fields(where, node, batch)
         elif is_number(node):
-            batched.append(False)
+            batched.append(_is_key(node) and node.shape == (batch,))
         elif not (path and _is_choice(node)):
             allowed = (
                 "a number; a class of your own is made a component by the decorator cpjax.pytree.pytree, or by "
@@ -344,6 +345,20 @@ class Hidden:
 jax.tree_util.register_pytree_node(Hidden, lambda node: ((), node.value), lambda value, _: Hidden(value))
 
 
+class KeyData:
+    """A typed random key (`jax.random.key`) as the numbers that it is made of, which NumPy can hold."""
+
+    def __init__(self, data: Any, kind: str) -> None:
+        self.data, self.kind = data, kind
+
+
+jax.tree_util.register_pytree_node(KeyData, lambda node: ((node.data,), node.kind), lambda kind, d: KeyData(*d, kind))
+
+
+def _is_key(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
 def hide(tree: T) -> T:
     """Returns the tree with leaves that are no numbers hidden from JAX."""
     leaves, structure = jax.tree.flatten(tree)
@@ -354,13 +369,15 @@ def hide(tree: T) -> T:
 
 
 def as_arguments(name: str, tree: T, dtype: Any) -> T:
-    """Returns the tree as JAX can trace it: numbers cast to `dtype` (see `cast`), other leaves hidden.
+    """Returns the tree as JAX can trace it: numbers cast to `dtype` (see `cast`), other leaves hidden, keys as numbers.
 
     Raises:
       InputError: a leaf that is no number cannot be hashed.
     """
 
     def convert(leaf: Any) -> Any:
+        if _is_key(leaf):
+            return KeyData(jax.random.key_data(leaf), str(jax.random.key_impl(leaf)))
         if is_number(leaf):
             return _cast(leaf, dtype)
         try:
@@ -376,10 +393,12 @@ def as_arguments(name: str, tree: T, dtype: Any) -> T:
 def reveal(tree: T) -> T:
     """Returns the tree with what `hide` or `as_arguments` has hidden."""
 
-    def is_hidden(node: Any) -> bool:
-        return isinstance(node, Hidden)
+    def show(node: Any) -> Any:
+        if isinstance(node, KeyData):
+            return jax.random.wrap_key_data(node.data, impl=node.kind)
+        return node.value if isinstance(node, Hidden) else node
 
-    revealed: T = jax.tree.map(lambda node: node.value if is_hidden(node) else node, tree, is_leaf=is_hidden)
+    revealed: T = jax.tree.map(show, tree, is_leaf=lambda node: isinstance(node, (Hidden, KeyData)))
     return revealed
 
 

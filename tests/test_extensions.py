@@ -16,6 +16,7 @@ from oracles import columns, derivative
 from scipy.integrate import solve_ivp
 
 import cpjax
+from cpjax import paper
 from cpjax.numeric.differences import central_differences
 from cpjax.numeric.trigonometry import wrap_angle
 
@@ -385,3 +386,44 @@ def test_on_the_continuous_clock_the_walls_stand_beside_clip_and_gate():
     assert np.max(np.abs(columns(fine.state) - columns(coarse.state))) <= 1e-6
     with pytest.raises(cpjax.InputError, match=r"switching = 'per_step': must be located, or absent, for a plant with"):
         cpjax.rollout(walls, controller, cpjax.HANGING, duration=0.1, dt=0.002, switching="per_step")
+
+
+# --- random keys ------------------------------------------------------------------------------------------------------
+
+
+@cpjax.pytree.pytree
+class Dithering:
+    """Adds noise to a command, from a random key in its memory."""
+
+    law: cpjax.StateFeedback
+    key: jax.Array
+
+    def init(self, measurement):
+        return self.key
+
+    def update(self, key, measurement):
+        key, now = jax.random.split(key)
+        voltage = self.law.voltage(measurement)
+        return key, voltage + 0.1 * jax.random.normal(now, dtype=voltage.dtype)
+
+
+@pytest.mark.parametrize("make", [jax.random.key, jax.random.PRNGKey])
+def test_a_random_key_may_be_part_of_a_controller_and_of_its_memory(make):
+    law = paper.regulator("lqr", "printed", PLANT)
+    starts = many(cpjax.State(0.0, 0.0, 0.1, 0.0), 3)
+    swept = cpjax.sweep(PLANT, Dithering(law, make(1)), starts, **RUN)
+    mapped = jax.vmap(lambda start: cpjax.measure(PLANT, Dithering(law, make(1)), start, **RUN))(starts)
+    assert_close(swept, mapped, 1e-9)
+    assert np.all(
+        np.asarray(swept.effort) != np.asarray(cpjax.sweep(PLANT, Dithering(law, make(2)), starts, **RUN).effort)
+    )
+
+
+def test_each_initial_state_may_have_a_random_key_of_its_own():
+    law, keys = paper.regulator("lqr", "printed", PLANT), jax.random.split(jax.random.key(1), 3)
+    start = cpjax.State(0.0, 0.0, 0.1, 0.0)
+    starts = jax.tree.map(lambda value: np.full(3, value), start)
+    swept = cpjax.sweep(PLANT, Dithering(law, keys), starts, **RUN)
+    alone = [float(cpjax.measure(PLANT, Dithering(law, key), start, **RUN).effort) for key in keys]
+    np.testing.assert_allclose(swept.effort, alone, rtol=1e-9)
+    assert len(set(alone)) == 3
