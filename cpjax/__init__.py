@@ -4,12 +4,15 @@ A plant, a controller and a start go in; a trajectory, its metrics and their der
 million. Importing this package starts no JAX backend, draws nothing and changes none of JAX's settings.
 """
 
+from cpjax import _moved as _moved
 from cpjax import startup as _startup  # noqa: F401  # first of all: the other imports take a second
 
 # isort: split
+import importlib
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
-from cpjax import paper
+from cpjax.backend.runtime import configure_cpu
 from cpjax.controllers import (
     REGULATE,
     SWING_UP,
@@ -26,24 +29,21 @@ from cpjax.controllers import (
     VoltageSignal,
     as_sampled,
 )
-from cpjax.design.discretization import discretize, discretize_cost
-from cpjax.design.lqr import dlqr, lqr
-from cpjax.design.placement import QuadraticFactors, place, place_polynomial
-from cpjax.design.riccati import care, dare
 from cpjax.errors import DerivativeWarning, InputError, PerformanceWarning
 from cpjax.io import load, save
+from cpjax.linear.discretization import discretize, discretize_cost
+from cpjax.linear.lqr import dlqr, lqr
+from cpjax.linear.placement import QuadraticFactors, place, place_polynomial
+from cpjax.linear.riccati import care, dare
 from cpjax.numeric.quantisation import quantize
-from cpjax.plant import CartPole, LinearModel, Motor, linearize
+from cpjax.plant import HANGING, UPRIGHT, CartPole, LinearModel, Motor, State, linearize, sample_starts
 from cpjax.presets import preset
-from cpjax.runtime import configure_cpu
 from cpjax.sim.flags import Flag
 from cpjax.sim.gradients import Gradients, gradients
 from cpjax.sim.metrics import Metrics, ProtocolMetrics, TimeOutside
 from cpjax.sim.rollout import Trajectory, measure, rollout
 from cpjax.sim.settings import Simulation
 from cpjax.sim.sweep import sweep
-from cpjax.starts import sample_starts
-from cpjax.state import HANGING, UPRIGHT, State
 from cpjax.study.recording import read_sweep, record_sweep
 
 try:
@@ -107,3 +107,10 @@ __all__ = [
     "save",
     "sweep",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Imports `cpjax.paper`, the application, when it is first used."""
+    if name == "paper":
+        return importlib.import_module("cpjax.paper")
+    raise AttributeError(f"module 'cpjax' has no attribute {name!r}")

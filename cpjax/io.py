@@ -7,6 +7,7 @@ infinities, so there they are the strings "inf", "-inf" and "nan".
 
 import contextlib
 import dataclasses
+import importlib
 import importlib.metadata
 import json
 import math
@@ -24,7 +25,6 @@ import jax
 import numpy as np
 import tomli_w
 
-from cpjax import paper
 from cpjax.controllers import (
     AngleGate,
     AngleRateGate,
@@ -40,10 +40,10 @@ from cpjax.controllers import (
 )
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor
+from cpjax.plant.state import State
 from cpjax.pytree import is_traced
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import Trajectory
-from cpjax.state import State
 
 _NON_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
@@ -66,8 +66,6 @@ TYPES: dict[str, type] = {
         PoleFactors,
         StateFeedback,
         EnergySwingUp,
-        paper.PrintedSwingUp,
-        paper.CorrectedSwingUpAsVoltage,
         AngleGate,
         AngleRateGate,
         LyapunovGate,
@@ -80,10 +78,31 @@ TYPES: dict[str, type] = {
         Trajectory,
     )
 }
-"""What can be saved, by the tag in the file."""
+"""What can be saved, by the tag in the file; see `register`."""
+
+_REGISTERING = ("cpjax.paper",)
+"""Modules that register more types when they are imported, which happens when a file holds a type not known before."""
 
 _UNCHECKED = (State, Metrics, Trajectory)
 """Classes whose constructors take anything."""
+
+
+def register(cls: type) -> type:
+    """Lets instances of a class made by `cpjax.pytree.pytree` be saved and loaded, under the class's name.
+
+    Raises:
+      InputError: another class of that name is known.
+    """
+    if TYPES.setdefault(cls.__name__, cls) is not cls:
+        raise InputError("cls", cls, "a class with a name of its own")
+    return cls
+
+
+def _known_type(tag: Any) -> type | None:
+    if isinstance(tag, str) and tag not in TYPES:
+        for name in _REGISTERING:
+            importlib.import_module(name)
+    return TYPES.get(tag) if isinstance(tag, str) else None
 
 
 def save(path: str | Path, thing: Any) -> None:
@@ -129,7 +148,7 @@ def load_part(path: str | Path, key: Literal["plant", "controller"], wanted: str
     table = read_table(path)
     if "type" not in table and isinstance(table.get(key), dict):
         return _decode(table[key], f"{path}: {key}")
-    if table.get("type") not in [*TYPES]:
+    if _known_type(table.get("type")) is None:
         raise InputError(key, str(path), f"a file that holds {wanted}; this one holds {contents(table)}")
     return load(path)
 
@@ -309,9 +328,9 @@ def _encode_value(name: str, value: Any) -> Any:
 def _decode(table: dict[str, Any], path: str) -> Any:
     table = dict(table)
     tag = table.pop("type", None)
-    if not isinstance(tag, str) or tag not in TYPES:
+    cls = _known_type(tag)
+    if cls is None:
         raise InputError(f"{path}: type", tag, "one of " + ", ".join(TYPES))
-    cls = TYPES[tag]
     fields = {f.name: f for f in dataclasses.fields(cls)}
     if cls is Trajectory:
         table["outputs"] = {key: table.pop(key) for key in list(table) if key not in fields}

@@ -11,9 +11,9 @@ import numpy as np
 from cpjax import io
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
+from cpjax.plant.state import State
 from cpjax.sim.metrics import Fold, Metrics
 from cpjax.sim.sweep import sweep
-from cpjax.state import State
 from cpjax.tune.outcome import document, request
 from cpjax.tune.parameters import FreeParameters
 from cpjax.tune.plan import Plan

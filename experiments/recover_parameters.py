@@ -17,13 +17,21 @@ import numpy as np
 from _common import run
 
 from cpjax import io, paper
+from cpjax.paper.gain_identification import GainAudit, audit_gains, document
+from cpjax.paper.plant_fit import PARAMETERS
+from cpjax.paper.printed_gains import PrintedGain
+from cpjax.paper.printed_gains import printed_in_the_paper as papers_prints
 from cpjax.plant import CartPole, Motor, linearize, with_parameters
 from cpjax.show.figures import save_figure
-from cpjax.show.forensics import DIRECTION_HEADER, FIT_HEADER, direction_cells, findings, fit_cells, picture, shown_fits
-from cpjax.study.forensics import GainAudit, audit_gains, document
-from cpjax.study.plant_fit import PARAMETERS
-from cpjax.study.printed_gains import PrintedGain
-from cpjax.study.printed_gains import printed_in_the_paper as papers_prints
+from cpjax.show.gain_identification import (
+    DIRECTION_HEADER,
+    FIT_HEADER,
+    direction_cells,
+    findings,
+    fit_cells,
+    picture,
+    shown_fits,
+)
 
 IDENTIFIABLE = ("pole_length", "cart_friction", "torque_constant")
 """Three that the gains tell apart."""

@@ -17,12 +17,12 @@ from _common import run
 
 from cpjax import io, paper
 from cpjax.plant import CartPole
+from cpjax.plant.initial_states import sample_starts
+from cpjax.plant.state import NAMES, State
 from cpjax.presets import preset
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.rollout import rollout
 from cpjax.sim.sweep import sweep
-from cpjax.starts import sample_starts
-from cpjax.state import NAMES, State
 
 INTERVALS, HOLD, HOLD_INTERVALS, BAND = 80, 1.0, 20, 0.05
 

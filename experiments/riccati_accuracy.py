@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 import cpjax
 from cpjax import io
 from cpjax.cli.progress import progress
-from cpjax.design.riccati import solve_care, solve_dare
+from cpjax.linear.riccati import solve_care, solve_dare
 from cpjax.show.figures import save_figure
 
 Solve: TypeAlias = Callable[[Equation, System, Any], tuple[Matrix, Matrix]]

@@ -15,8 +15,8 @@ from _common import run
 from cpjax import io
 from cpjax.numeric.statistics import two_proportion_p_value
 from cpjax.paper import Design
+from cpjax.paper.reproduction import Setting, Variant, evaluate
 from cpjax.show.figures import save_figure, success_rates
-from cpjax.study.reproduction import Setting, Variant, evaluate
 from cpjax.study.summary import summarise
 
 REFERENCE_COUNT = 512

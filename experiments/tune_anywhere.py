@@ -13,13 +13,13 @@ from _common import run
 from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned
 
 from cpjax import io, paper
+from cpjax.plant.initial_states import sample_starts
 from cpjax.presets import preset
 from cpjax.sim.sweep import sweep
-from cpjax.starts import sample_starts
 from cpjax.study.summary import summarise
+from cpjax.tune.baseline import baseline
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
-from cpjax.tune.starting import beginning
 
 PLAN: dict[str, Any] = {"starts": "anywhere", "duration": 5.0, "horizon": 8.0, "horizon_dt": 0.01}
 
@@ -31,7 +31,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     rows = []
     for design in get_args(paper.Design)[: 1 if quick else None]:
         plan = Plan(seed=seed, **(PLAN | (QUICK if quick else {})))
-        free = free_parameters(beginning("bland", design, plant))
+        free = free_parameters(baseline(design, plant))
         aimed, made = tuned(out, f"{design}-{seed}", plant, free, plan)
         for name, controller in (("hanging", preset(design)), ("anywhere", aimed)):
             found = summarise(sweep(plant, controller, starts, duration=20.0, dt=0.002, clock="sampled"))

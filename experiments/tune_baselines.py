@@ -21,12 +21,12 @@ from _tuned import EVALUATION_SEED
 from scipy.optimize import minimize
 
 from cpjax import io, paper
+from cpjax.plant.initial_states import sample_starts
 from cpjax.sim.rollout import measure
 from cpjax.sim.sweep import sweep
-from cpjax.starts import sample_starts
 from cpjax.study.summary import summarise
+from cpjax.tune.baseline import baseline
 from cpjax.tune.parameters import FreeParameters, free_parameters
-from cpjax.tune.starting import beginning
 
 HORIZON, DT, STARTS, EVALUATIONS = 5.0, 0.004, 192, 2240
 Numbers: TypeAlias = np.ndarray[Any, Any]
@@ -41,7 +41,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     unseen = sample_starts("hanging", 64 if quick else 10_000, seed=EVALUATION_SEED)
     plant = paper.appendix_plant()
     for method, design, number in itertools.product(_SEARCHES, designs, range(seed, seed + (1 if quick else 5))):
-        free = free_parameters(beginning("bland", design, plant))
+        free = free_parameters(baseline(design, plant))
         began = time.perf_counter()
         score, asked = _score(free, number, 4 if quick else STARTS), 0
 

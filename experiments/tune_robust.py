@@ -23,15 +23,15 @@ from cpjax import io, paper
 from cpjax.controllers import Hybrid
 from cpjax.numeric.statistics import wilson_interval
 from cpjax.plant import CartPole
+from cpjax.plant.initial_states import sample_starts
+from cpjax.plant.state import State
 from cpjax.presets import preset
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.rollout import measure
-from cpjax.starts import sample_starts
-from cpjax.state import State
+from cpjax.tune.baseline import baseline
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
 from cpjax.tune.plants import UNCERTAIN, sample_plants
-from cpjax.tune.starting import beginning
 
 SPREAD, PER_PLANT = 0.2, 4
 # One plant in ten is hard for any controller, and a share of 128 starts says too little about the others.
@@ -52,7 +52,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     controllers: dict[str, Hybrid] = {}
     for design in get_args(paper.Design)[: 1 if quick else None]:
         plan = Plan(seed=seed, **(PLAN | (QUICK if quick else {})))
-        free = free_parameters(beginning("bland", design, nominal))
+        free = free_parameters(baseline(design, nominal))
         controllers[f"{design}, nominal"] = preset(design)
         controllers[f"{design}, over plants"], _ = tuned(out, f"{design}-{seed}", nominal, free, plan)
     print(f"{'success [%]':20}" + "".join(f"{name:>24}" for name in controllers))

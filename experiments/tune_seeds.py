@@ -19,15 +19,15 @@ from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned
 
 from cpjax import io, paper
 from cpjax.controllers import Hybrid, StateFeedback
+from cpjax.paper.initial import initial_controller
 from cpjax.plant import CartPole, linearize
+from cpjax.plant.initial_states import sample_starts
 from cpjax.presets import PRESETS
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.sweep import sweep
-from cpjax.starts import sample_starts
 from cpjax.study.summary import summarise
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
-from cpjax.tune.starting import beginning
 
 CASES = (("appendix", "bland", 5), ("appendix", "paper", 5), ("identified", "bland", 1))
 
@@ -45,7 +45,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     for name, design, begin, number in cases[:1] if quick else cases:
         plant = paper.PLANTS[name]()
         plan = Plan(seed=number, **(QUICK if quick else {}))
-        free = free_parameters(beginning(begin, design, plant))
+        free = free_parameters(initial_controller(begin, design, plant))
         case = f"{name}-{design}-{begin}-{number}"
         controller, made = tuned(out, case, plant, free, plan)
         judged = judge(plant, controller, 64 if quick else 10_000)

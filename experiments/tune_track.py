@@ -16,14 +16,14 @@ from _common import run
 from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned
 
 from cpjax import io, paper
+from cpjax.plant.initial_states import sample_starts
 from cpjax.sim.metrics import ProtocolMetrics
 from cpjax.sim.sweep import sweep
-from cpjax.starts import sample_starts
 from cpjax.study.summary import summarise
+from cpjax.tune.baseline import baseline
 from cpjax.tune.objective import Goal
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
-from cpjax.tune.starting import beginning
 
 LIMITS = (0.8, 0.6, 0.5)
 FREELY: dict[str, Any] = {"duration": 6.0, "horizon": 10.0, "horizon_dt": 0.01}
@@ -43,11 +43,11 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     starts = sample_starts("hanging", 64 if quick else 10_000, seed=EVALUATION_SEED)
     rows = []
     cases = itertools.product(get_args(paper.Design), LIMITS)
-    controller = beginning("bland", "placement", plant, "lyapunov")
+    controller = baseline("placement", plant, "lyapunov")
     for design, limit in itertools.islice(cases, 1 if quick else None):
         further = limit == LIMITS[-1]
         if not further:
-            controller = beginning("bland", design, plant, "lyapunov")
+            controller = baseline(design, plant, "lyapunov")
         free = free_parameters(controller)
         goal = Goal(track=3.0, track_limit=limit)
         tunings = []

@@ -25,16 +25,16 @@ from _common import run
 
 from cpjax import io, paper
 from cpjax.cli.tables import print_table
+from cpjax.plant.initial_states import sample_starts
+from cpjax.plant.state import State
 from cpjax.sim.metrics import TimeOutside
 from cpjax.sim.rollout import measure
-from cpjax.starts import sample_starts
-from cpjax.state import State
-from cpjax.study.front import Aim, Tracer
-from cpjax.study.front_judge import BATCH, Judge
-from cpjax.study.front_plan import FrontPlan
+from cpjax.study.fronts.config import FrontPlan
+from cpjax.study.fronts.evaluator import BATCH, Judge
+from cpjax.study.fronts.trace import Aim, Tracer
+from cpjax.tune.baseline import baseline
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
-from cpjax.tune.starting import beginning
 
 FUSION, LOOPS = "xla_cpu_use_multi_output_fusion=true", "xla_cpu_small_while_loop_byte_threshold=16777216"
 OPTIONS = {"none": "", "fusion and small loops": f"{FUSION},{LOOPS}"}
@@ -81,7 +81,7 @@ def _in_a_process(design: str, work: str, options: str, quick: bool) -> float:
 
 def _measure(design: Any, work: str, quick: bool) -> float:
     plant = paper.appendix_plant()
-    free = free_parameters(beginning("bland", design, plant))
+    free = free_parameters(baseline(design, plant))
     plan = Plan()
     if work == "fronts":
         return _measure_fronts(plant, design, quick)

@@ -17,8 +17,8 @@ from scipy.integrate import solve_ivp
 
 import cpjax
 from cpjax import paper
+from cpjax.numeric.angles import wrap_angle
 from cpjax.numeric.differences import central_differences
-from cpjax.numeric.trigonometry import wrap_angle
 
 PLANT = cpjax.CartPole()
 

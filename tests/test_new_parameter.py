@@ -18,10 +18,10 @@ from cpjax import CartPole, EnergySwingUp, InputError, Motor, State, paper
 from cpjax.bridges.known import EXPRESSED
 from cpjax.bridges.mujoco import model_xml
 from cpjax.bridges.python_control import plant_system
+from cpjax.paper.plant_fit import PARAMETERS, scale_of
 from cpjax.plant import parameter, parameters_of, with_parameters
 from cpjax.pytree import Number, Scalar, number, numbers, pytree
 from cpjax.study.named_parameters import parametrise
-from cpjax.study.plant_fit import PARAMETERS, scale_of
 from cpjax.tune.plants import UNCERTAIN, sample_plants
 
 APPENDIX, ROUGH = paper.appendix_plant(), rough_plant()
@@ -188,10 +188,10 @@ from cpjax import cli, paper
 from cpjax.bridges.mujoco import model_xml
 from cpjax.bridges.python_control import plant_system
 from cpjax.plant import with_parameters
-from cpjax.study.forensics import audit_gains
+from cpjax.paper.gain_identification import audit_gains
 from cpjax.study.named_parameters import parametrise
-from cpjax.study.plant_fit import PARAMETERS, scale_of
-from cpjax.study.printed_gains import printed_in_the_paper
+from cpjax.paper.plant_fit import PARAMETERS, scale_of
+from cpjax.paper.printed_gains import printed_in_the_paper
 from cpjax.tune.plants import UNCERTAIN, sample_plants
 
 here, name = Path(__file__).parent, "coulomb_friction"
@@ -264,7 +264,7 @@ np.testing.assert_allclose(swept.cart_travel, np.max(np.abs(slowed.x)), rtol=1e-
 def test_a_parameter_added_to_the_source_by_one_declaration_and_one_term_works_everywhere(tmp_path):
     source = Path(cpjax.__file__).parent
     shutil.copytree(source, tmp_path / "cpjax", ignore=shutil.ignore_patterns("__pycache__"))
-    plant = tmp_path / "cpjax" / "plant.py"
+    plant = tmp_path / "cpjax" / "plant" / "cartpole.py"
     text = plant.read_text()
     assert text.count(BEFORE) == text.count(TERM[0]) == 1
     plant.write_text(text.replace(BEFORE, ADDED + BEFORE).replace(*TERM))

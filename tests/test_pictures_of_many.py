@@ -182,25 +182,25 @@ def trace_once(trace, stop):
 @pytest.mark.slow
 def test_pareto_keeps_a_finished_design_when_it_is_stopped(command, tmp_path, monkeypatch):
     from cpjax.cli import pareto
-    from cpjax.study.front import Tracer
+    from cpjax.study.fronts.trace import Tracer
 
     small = ("--bounds", 2, "--candidates", 64, "--steps", 2, "--final", 16, "--supplies", 12, "--out", tmp_path)
 
     with monkeypatch.context() as patch:
-        patch.setattr("cpjax.study.front._front", stop)  # after the searches of the first design
+        patch.setattr("cpjax.study.fronts.trace._front", stop)  # after the searches of the first design
         assert command("pareto", *small).code == 130
     parts = tmp_path / "pareto.parts"
     assert sorted(part.name for part in parts.rglob("*.npz")) == ["random.npz", "traced.npz"]
     with monkeypatch.context() as patch:
         patch.setattr(pareto, "compare", stop)
-        patch.setattr("cpjax.study.front.Tracer.trace", trace_once(Tracer.trace, stop))
+        patch.setattr("cpjax.study.fronts.trace.Tracer.trace", trace_once(Tracer.trace, stop))
         assert command("pareto", *small).code == 130
     assert len(list(parts.rglob("fronts.json"))) == 2
     other = command("pareto", *small, "--seed", 2)
     assert other.code == 2
     assert "without the parts of other work" in other.err
     with monkeypatch.context() as patch:
-        patch.setattr("cpjax.study.front.trace_fronts", stop)  # nothing is traced again
+        patch.setattr("cpjax.study.fronts.trace.trace_fronts", stop)  # nothing is traced again
         assert command("pareto", *small).code == 0
     assert not parts.exists()
     document = json.loads((tmp_path / "pareto.json").read_text())

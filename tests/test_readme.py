@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cpjax.cli import make_parser
-from cpjax.study.reproduction import Setting, reproduce
+from cpjax.paper.reproduction import Setting, reproduce
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -84,7 +84,7 @@ def test_no_page_has_a_broken_link():
 def test_every_test_that_the_paper_page_names_exists():
     named = set(re.findall(r"`(test_\w+)`", (ROOT / "docs" / "paper.md").read_text()))
     assert len(named) > 30
-    tests = "".join(path.read_text() for path in (ROOT / "tests").glob("test_paper*.py"))
+    tests = "".join(path.read_text() for path in (ROOT / "tests" / "paper").glob("test_paper*.py"))
     assert [name for name in sorted(named) if f"def {name}(" not in tests] == []
 
 

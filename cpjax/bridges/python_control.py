@@ -22,11 +22,11 @@ from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import Law, ModalController, SingleLaw, as_controller
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor, linearize
+from cpjax.plant.state import NAMES, State
 from cpjax.pytree import Number, cast, is_traced
 from cpjax.sim.integrators import rk4
 from cpjax.sim.settings import check_settings
 from cpjax.sim.stepper import applied_voltage, step_held
-from cpjax.state import NAMES, State
 
 Vector: TypeAlias = np.ndarray[Any, Any]
 

@@ -120,7 +120,7 @@ def _run(arguments: list[str], set_up: bool) -> int:
     import numpy as np
 
     if set_up:
-        from cpjax import runtime
+        from cpjax.backend import runtime
 
         runtime.keep_compilations()
         if getattr(options, "many_starts", False):

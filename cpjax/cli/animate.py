@@ -23,8 +23,8 @@ from cpjax.cli.progress import progress
 from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
+from cpjax.plant.state import State
 from cpjax.sim.rollout import Trajectory, rollout
-from cpjax.state import State
 
 CONTROLLERS = ("corrected/lqr", "tuned_lqr")
 _AFTER = 1.0  # seconds: who settles holds so long

@@ -10,9 +10,9 @@ from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.errors import InputError, MissingError
-from cpjax.study.forensics import GainAudit, audit_gains, write
-from cpjax.study.plant_fit import PARAMETERS
-from cpjax.study.printed_gains import PrintedGain, printed_in_the_paper
+from cpjax.paper.gain_identification import GainAudit, audit_gains, write
+from cpjax.paper.plant_fit import PARAMETERS
+from cpjax.paper.printed_gains import PrintedGain, printed_in_the_paper
 
 OPTIONS = [
     *PLANT_OPTIONS,
@@ -51,7 +51,7 @@ def run(given: argparse.Namespace) -> int:
     write(path, audit, prints, plant, seed=given.seed, **setting)
 
     from cpjax.show.figures import save_figure
-    from cpjax.show.forensics import findings, picture
+    from cpjax.show.gain_identification import findings, picture
 
     save_figure(given.out / "audit_gains.png", picture(audit))
     print_audit(audit, plant)
@@ -62,7 +62,7 @@ def run(given: argparse.Namespace) -> int:
 
 def print_audit(audit: GainAudit, plant: Any) -> None:
     """The tables for people."""
-    from cpjax.show.forensics import DIRECTION_HEADER, FIT_HEADER, direction_cells, fit_cells, shown_fits
+    from cpjax.show.gain_identification import DIRECTION_HEADER, FIT_HEADER, direction_cells, fit_cells, shown_fits
 
     title = "Residuals in units of the last printed digit"
     print_table(title, FIT_HEADER, [fit_cells(fit, plant) for fit in shown_fits(audit)], text_columns=2)

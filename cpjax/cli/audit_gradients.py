@@ -21,7 +21,7 @@ from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
-from cpjax.starts import START_SETS, sample_starts
+from cpjax.plant.initial_states import START_SETS, sample_starts
 from cpjax.study.gradient_audit import GradientAudit, audit_gradients, document
 from cpjax.study.named_parameters import parametrise
 

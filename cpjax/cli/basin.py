@@ -19,8 +19,8 @@ from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
+from cpjax.plant.state import NAMES, UNITS
 from cpjax.sim.metrics import Metrics
-from cpjax.state import NAMES, UNITS
 from cpjax.study.basin import MOST_CELLS, Axis, Map, area, document
 from cpjax.study.design_check import DesignCheck, check_design
 from cpjax.study.recording import read_sweep, record_sweep

@@ -15,11 +15,11 @@ from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid, LqrWeights, PoleFactors
 from cpjax.errors import InputError
+from cpjax.paper.comparison import Compared, Entry, best, compare, document, entries
+from cpjax.paper.reproduction import DESIGNS, Setting
 from cpjax.plant import CartPole
+from cpjax.plant.state import NAMES, State
 from cpjax.sim.rollout import rollout
-from cpjax.state import NAMES, State
-from cpjax.study.comparison import Compared, Entry, best, compare, document, entries
-from cpjax.study.reproduction import DESIGNS, Setting
 
 OPTIONS = [
     *PLANT_OPTIONS,

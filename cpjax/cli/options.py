@@ -29,15 +29,15 @@ from cpjax.controllers import (
 )
 from cpjax.controllers.gates import Gate
 from cpjax.controllers.protocol import Controller, as_controller
-from cpjax.design.lqr import lqr
-from cpjax.design.placement import place
 from cpjax.errors import InputError, MissingError
+from cpjax.linear.lqr import lqr
+from cpjax.linear.placement import place
 from cpjax.plant import CartPole, Motor, linearize, with_parameters
+from cpjax.plant.initial_states import START_SETS, sample_starts
+from cpjax.plant.state import NAMES, UNITS, State
 from cpjax.presets import PRESETS, preset
 from cpjax.pytree import Number, rules
 from cpjax.sim.integrators import INTEGRATORS
-from cpjax.starts import START_SETS, sample_starts
-from cpjax.state import NAMES, UNITS, State
 
 _LONG_NAME = 48  # more letters of a file's name have no place above a picture
 

@@ -15,14 +15,14 @@ from cpjax.cli.output import say
 from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
 from cpjax.errors import InputError
+from cpjax.paper.comparison import Compared, compare, entries
+from cpjax.paper.reproduction import DESIGNS, Setting
 from cpjax.plant import CartPole
-from cpjax.study.comparison import Compared, compare, entries
-from cpjax.study.front_plan import COSTS, FrontPlan
-from cpjax.study.reproduction import DESIGNS, Setting
+from cpjax.study.fronts.config import COSTS, FrontPlan
 
 if TYPE_CHECKING:  # imports of it take a while
     from cpjax.show.front import Curve
-    from cpjax.study.front_yardstick import Yardstick
+    from cpjax.study.fronts.reference_point import Yardstick
 
 Found: TypeAlias = dict[paper.Design, dict[str, Any]]
 """The fronts of each design, as plain values."""
@@ -92,7 +92,7 @@ def made(
     """The fronts of both designs, with pareto.json, pareto.png and supplies.png written; until then what is done is in
     the folder `parts`.
     """
-    from cpjax.study.front_yardstick import yardstick
+    from cpjax.study.fronts.reference_point import yardstick
 
     request = {"plan": dataclasses.asdict(plan), "plant": io.encode(plant), "supplies": supplies}
     with io.parts_of(parts, {**request, "versions": io.versions()}):
@@ -115,7 +115,7 @@ def made(
 
 def known_controllers(plant: CartPole, plan: FrontPlan) -> list[tuple[str, Compared]]:
     """The paper's printed gains and the controllers that come with cpjax, from the starts that measure the points."""
-    from cpjax.study.front_judge import FINAL
+    from cpjax.study.fronts.evaluator import FINAL
     from cpjax.tune.descent import seed_of
 
     setting = Setting(count=plan.final, seed=seed_of(plan.seed, FINAL, 0), duration=plan.horizon, dt=plan.final_dt)
@@ -139,7 +139,7 @@ def traced(
     if path.exists():
         return io.read_table(path)
 
-    from cpjax.study.front import trace_fronts  # optax takes a while; other commands should not wait for it
+    from cpjax.study.fronts.trace import trace_fronts  # optax takes a while; other commands should not wait for it
 
     with progress(f"pareto, {design}") as report:
         fronts = trace_fronts(

@@ -10,8 +10,8 @@ from cpjax.cli.options import EVALUATION_OPTIONS, Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.reproduce import print_rows, rows_of
 from cpjax.errors import InputError
+from cpjax.paper.reproduction import Setting
 from cpjax.study.basin import MOST_CELLS
-from cpjax.study.reproduction import Setting
 
 OPTIONS = [
     *EVALUATION_OPTIONS,

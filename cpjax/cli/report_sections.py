@@ -13,24 +13,24 @@ from cpjax.cli.options import controller_title, named_hybrid
 from cpjax.cli.progress import progress
 from cpjax.cli.tune import tuned
 from cpjax.controllers import AngleGate
+from cpjax.paper.comparison import Compared
+from cpjax.paper.gain_identification import audit_gains, write
+from cpjax.paper.printed_gains import printed_in_the_paper
+from cpjax.paper.reproduction import DESIGNS
+from cpjax.plant.state import HANGING
 from cpjax.presets import preset
 from cpjax.show import comparison as comparison_text
 from cpjax.show import design as design_text
-from cpjax.show import forensics as forensics_text
 from cpjax.show import front as front_text
+from cpjax.show import gain_identification as identification_text
 from cpjax.show import gradients as gradients_text
 from cpjax.show.figures import DESIGN_NAMES, save_figure
 from cpjax.show.page import Page
-from cpjax.state import HANGING
-from cpjax.study.comparison import Compared
 from cpjax.study.design_check import check_design, document
-from cpjax.study.forensics import audit_gains, write
-from cpjax.study.front_plan import FrontPlan
-from cpjax.study.printed_gains import printed_in_the_paper
-from cpjax.study.reproduction import DESIGNS
+from cpjax.study.fronts.config import FrontPlan
+from cpjax.tune.baseline import baseline
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import Plan
-from cpjax.tune.starting import beginning
 
 QUICK_FRONTS: Mapping[str, Any] = {
     "bounds": 11,
@@ -80,21 +80,21 @@ def forensics(page: Page, given: argparse.Namespace) -> None:
         "The printed gains do not follow from the printed parameters. Which parameters would have to differ, and what "
         "do eight printed numbers say about a plant at all? Residuals are in units of the last printed digit."
     )
-    for sentence in forensics_text.findings(audit):
+    for sentence in identification_text.findings(audit):
         page.text(sentence)
     page.picture(
-        save_figure(given.out / "audit_gains.png", forensics_text.picture(audit)),
+        save_figure(given.out / "audit_gains.png", identification_text.picture(audit)),
         "Left: the worst residual when one or two parameters may change; a circle marks pairs that explain all eight "
         "gains. Right: how strongly the gains depend on each combination of parameters.",
     )
     page.table(
-        forensics_text.FIT_HEADER,
-        [forensics_text.fit_cells(fit, plant) for fit in forensics_text.shown_fits(audit)],
+        identification_text.FIT_HEADER,
+        [identification_text.fit_cells(fit, plant) for fit in identification_text.shown_fits(audit)],
         text_columns=2,
     )
     page.note("Every fit stands in `audit_gains.json`; `cpjax audit-gains` does the same for any printed gain.")
-    known = [forensics_text.direction_cells(d) for d in audit.directions if d.sensitivity > 0.0]
-    page.table(forensics_text.DIRECTION_HEADER, known, text_columns=1)
+    known = [identification_text.direction_cells(d) for d in audit.directions if d.sensitivity > 0.0]
+    page.table(identification_text.DIRECTION_HEADER, known, text_columns=1)
 
 
 def gradients(page: Page, given: argparse.Namespace, size: str) -> None:
@@ -130,7 +130,7 @@ def tuning(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
     rows = []
     for design in DESIGNS[:1] if size == "quick" else DESIGNS:
         plan = Plan(seed=given.seed, **(QUICK_TUNING if size == "quick" else {}))
-        free = free_parameters(beginning("bland", design, plant))
+        free = free_parameters(baseline(design, plant))
         folder = given.out / f"tune-{design}"
         found = tuned(folder, plant, free, plan, parts / f"tune-{design}.npz")
         page.picture(

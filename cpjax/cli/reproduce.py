@@ -8,7 +8,7 @@ from cpjax.cli.options import EVALUATION_OPTIONS, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
-from cpjax.study.reproduction import Setting, reproduce
+from cpjax.paper.reproduction import Setting, reproduce
 
 
 def add_command(commands: Any) -> None:

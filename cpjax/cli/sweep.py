@@ -21,8 +21,8 @@ from cpjax.cli.options import (
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
+from cpjax.plant.initial_states import sample_starts
 from cpjax.sim.metrics import ProtocolMetrics
-from cpjax.starts import sample_starts
 from cpjax.study.recording import SUFFIXES, record_sweep
 from cpjax.study.summary import COSTS, summarise
 

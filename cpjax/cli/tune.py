@@ -16,12 +16,13 @@ from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
+from cpjax.paper.initial import initial_controller
 from cpjax.plant import CartPole
-from cpjax.starts import START_SETS
+from cpjax.plant.initial_states import START_SETS
+from cpjax.tune.baseline import GateKind
 from cpjax.tune.objective import Goal
 from cpjax.tune.parameters import FreeParameters, free_parameters
 from cpjax.tune.plan import AGGREGATES, Plan
-from cpjax.tune.starting import GateKind, beginning
 
 if TYPE_CHECKING:  # with optax, which takes a while
     from cpjax.tune.outcome import Tuning
@@ -132,7 +133,7 @@ def tuned(
 
 def _begin(name: str, plant: Any, chosen: dict[str, Any]) -> Hybrid:
     if Path(name).suffix.lower() not in (".json", ".toml"):
-        return beginning(name, chosen.pop("design", "lqr"), plant, **chosen)
+        return initial_controller(name, chosen.pop("design", "lqr"), plant, **chosen)
     for field, value in chosen.items():
         raise InputError(field, value, "absent: the file's controller has one")
     loaded = saved(name, "start_from")

@@ -1,7 +1,7 @@
 """What runs in the loop: laws, gates, and the hybrid controller that holds them."""
 
 from cpjax.controllers.energy import EnergySwingUp
-from cpjax.controllers.feedback import Design, LqrWeights, PoleFactors, StateFeedback
+from cpjax.controllers.feedback import Design, DesignName, LqrWeights, PoleFactors, StateFeedback
 from cpjax.controllers.gates import AngleGate, AngleRateGate, Gate, LyapunovGate
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import (
@@ -29,6 +29,7 @@ __all__ = [
     "Clocked",
     "Controller",
     "Design",
+    "DesignName",
     "EnergySwingUp",
     "Gate",
     "Hybrid",

@@ -12,11 +12,11 @@ import math
 
 import jax.numpy as jnp
 
-from cpjax.numeric.extremes import larger
-from cpjax.numeric.trigonometry import sin_cos
+from cpjax.backend.extremes import larger
+from cpjax.backend.trigonometry import sin_cos
 from cpjax.plant import CartPole
+from cpjax.plant.state import State
 from cpjax.pytree import Scalar, number, part, pytree
-from cpjax.state import State
 
 
 @pytree

@@ -1,18 +1,18 @@
 """Linear state feedback, and the two designs that it comes from."""
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cpjax.design.lqr import lqr
-from cpjax.design.lyapunov import lyapunov
-from cpjax.design.placement import QuadraticFactors, place_polynomial
 from cpjax.errors import InputError
+from cpjax.linear.lqr import lqr
+from cpjax.linear.lyapunov import lyapunov
+from cpjax.linear.placement import QuadraticFactors, place_polynomial
+from cpjax.plant.state import NAMES, UPRIGHT, State, checked_reference, deviation
 from cpjax.pytree import Array, Scalar, is_traced, matrix, number, part, pytree
-from cpjax.state import NAMES, UPRIGHT, State, checked_reference, deviation
 
 
 class Designed(NamedTuple):
@@ -22,6 +22,10 @@ class Designed(NamedTuple):
     """Gain (1, 4) of u = -K s."""
     P: jax.Array
     """(4, 4): s' P s falls along the linear closed loop."""
+
+
+DesignName: TypeAlias = Literal["placement", "lqr"]
+"""The ways in which a gain is designed, by name."""
 
 
 @runtime_checkable

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cpjax.backend.trigonometry import sin_cos
 from cpjax.controllers.protocol import REGULATE
 from cpjax.errors import InputError
-from cpjax.numeric.trigonometry import sin_cos
+from cpjax.plant.state import NAMES, UPRIGHT, State, checked_reference, deviation
 from cpjax.pytree import Array, Scalar, is_traced, matrix, number, part, pytree
-from cpjax.state import NAMES, UPRIGHT, State, checked_reference, deviation
 
 
 class Gate(Protocol):

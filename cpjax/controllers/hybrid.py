@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cpjax.checks import call, real
 from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.gates import Gate
 from cpjax.controllers.protocol import REGULATE, SWING_UP, Law, ModeMemory, start_memory, update_mode
+from cpjax.plant.state import State
 from cpjax.pytree import Scalar, part, pytree
-from cpjax.returned import call, real
-from cpjax.state import State
 
 
 @pytree

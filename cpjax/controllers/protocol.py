@@ -17,10 +17,10 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 
+from cpjax.checks import call, integer, real
 from cpjax.errors import InputError
+from cpjax.plant.state import State
 from cpjax.pytree import Scalar, part, pytree
-from cpjax.returned import call, integer, real
-from cpjax.state import State
 
 SWING_UP = 0
 """Mode in which the swing-up law acts. A controller of a single law is always in mode 0."""

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from cpjax.controllers.gates import Gate
 from cpjax.controllers.protocol import SWING_UP, Law
+from cpjax.plant.state import State
 from cpjax.pytree import Scalar, number, part, pytree
-from cpjax.state import State
 
 
 @pytree

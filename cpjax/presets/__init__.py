@@ -7,17 +7,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from cpjax import io, paper
-from cpjax.controllers import Hybrid
+from cpjax import io
+from cpjax.controllers import DesignName, Hybrid
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor
 from cpjax.pytree import Number, rules
 
-PRESETS: Mapping[paper.Design, str] = {"lqr": "tuned_lqr", "placement": "tuned_place"}
+PRESETS: Mapping[DesignName, str] = {"lqr": "tuned_lqr", "placement": "tuned_place"}
 """The name of each design's; `cpjax.save` wrote the file of that name in this folder."""
 
 
-def preset(design: paper.Design) -> Hybrid:
+def preset(design: DesignName) -> Hybrid:
     """Loads the tuned hybrid controller whose regulator comes from "lqr" or "placement".
 
     Both were made for `cpjax.paper.appendix_plant()`, with its supply of 12 V. On another plant they may fail:

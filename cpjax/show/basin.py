@@ -13,9 +13,9 @@ from matplotlib.lines import Line2D
 from cpjax.controllers import Hybrid
 from cpjax.controllers.protocol import SWING_UP
 from cpjax.errors import InputError
+from cpjax.plant.state import NAMES, State
 from cpjax.show.figures import GATE_COLOUR, as_text
 from cpjax.sim.metrics import Metrics
-from cpjax.state import NAMES, State
 from cpjax.study.basin import Area, Map
 from cpjax.study.design_check import DesignCheck
 

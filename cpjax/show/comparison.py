@@ -13,14 +13,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from cpjax.controllers import REGULATE, SWING_UP, Hybrid
+from cpjax.numeric.angles import wrap_angle
 from cpjax.numeric.statistics import mcnemar_p_value
-from cpjax.numeric.trigonometry import wrap_angle
+from cpjax.paper.comparison import Compared, best
+from cpjax.paper.reproduction import DESIGNS
 from cpjax.plant import CartPole
+from cpjax.plant.state import State
 from cpjax.show.figures import DESIGN_COLOURS, DESIGN_NAMES, GATE_COLOUR, SIDE_BY_SIDE
 from cpjax.sim.rollout import Trajectory
-from cpjax.state import State
-from cpjax.study.comparison import Compared, best
-from cpjax.study.reproduction import DESIGNS
 
 HEADER = (
     "controller",

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from cpjax.controllers import SWING_UP
 from cpjax.controllers.gates import Gate
-from cpjax.design.structure import Structure
+from cpjax.linear.structure import Structure
+from cpjax.plant.state import NAMES, UNITS, UPRIGHT, State
 from cpjax.show.figures import DESIGN_NAMES, GATE_COLOUR
-from cpjax.state import NAMES, UNITS, UPRIGHT, State
 from cpjax.study.design_check import DesignCheck
 
 _INK, _CLIP = "#333333", "#CC79A7"

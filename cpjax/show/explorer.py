@@ -6,10 +6,10 @@ from matplotlib.figure import Figure
 
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
+from cpjax.plant.state import HANGING, State
 from cpjax.show.comparison import wrapped
 from cpjax.show.figures import design_colour
 from cpjax.sim.rollout import Trajectory, rollout
-from cpjax.state import HANGING, State
 
 
 class Explorer:

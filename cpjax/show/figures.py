@@ -13,14 +13,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cpjax import io, paper
-from cpjax.controllers import REGULATE, Hybrid, PoleFactors
+from cpjax import io
+from cpjax.controllers import REGULATE, DesignName, Hybrid, PoleFactors
 from cpjax.sim.rollout import Trajectory
 
 DESIGN_COLOURS: Mapping[str, str] = {"lqr": "#D55E00", "placement": "#0072B2"}
 GATE_COLOUR = "#E69F00"
 DESIGN_NAMES: Mapping[str, str] = {"lqr": "LQR", "placement": "pole placement"}
-SIDE_BY_SIDE: tuple[paper.Design, ...] = ("lqr", "placement")
+SIDE_BY_SIDE: tuple[DesignName, ...] = ("lqr", "placement")
 """From left to right, as the paper's Figures 3 and 4."""
 _X, _THETA, _VOLTAGE, _CATCH = "#009E73", "#CC79A7", "#333333", "#999999"
 

@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 
 from cpjax import paper
 from cpjax.numeric.statistics import two_proportion_p_value
+from cpjax.paper.reproduction import Setting, representative, trajectory
 from cpjax.show.figures import DESIGN_NAMES, SIDE_BY_SIDE, paper_figures
-from cpjax.study.reproduction import Setting, representative, trajectory
 
 SHOWN = (("as-printed", "appendix", 10.0), ("corrected-centred", "appendix", 10.0))
 """Law, plant and longest shown time [s] of the pictures that stand for the paper's Figures 3 to 6."""

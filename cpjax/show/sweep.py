@@ -3,9 +3,9 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpjax.numeric.trigonometry import wrap_angle
+from cpjax.numeric.angles import wrap_angle
+from cpjax.plant.state import State
 from cpjax.sim.metrics import Metrics
-from cpjax.state import State
 
 _MOST = 20_000  # dots that a picture can use
 _FAILED = "#D55E00"

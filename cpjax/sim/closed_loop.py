@@ -9,10 +9,10 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from cpjax.compilation import part_of_step
+from cpjax.backend.single_kernel import part_of_step
+from cpjax.checks import call, integer, real
 from cpjax.controllers.protocol import SmoothController, demand
 from cpjax.errors import InputError
-from cpjax.returned import call, integer, real
 from cpjax.sim import plants
 from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.stepper import dtype_of

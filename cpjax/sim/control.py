@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from cpjax.checks import call, integer, like, pair, real
 from cpjax.controllers.protocol import ModeMemory, as_sampled, modes_in, start_memory
 from cpjax.pytree import cast
-from cpjax.returned import call, integer, like, pair, real
 from cpjax.sim import plants
 from cpjax.sim.derivatives import difference, holding, shift_of, shifted, tracked, with_zeros
 from cpjax.sim.plants import Plant, Tree

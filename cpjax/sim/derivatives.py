@@ -32,6 +32,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from cpjax.checks import call, integer, real
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import (
     Controller,
@@ -46,7 +47,6 @@ from cpjax.controllers.protocol import (
 )
 from cpjax.errors import DerivativeWarning, InputError
 from cpjax.pytree import Scalar, part, pytree
-from cpjax.returned import call, integer, real
 
 _NEEDS = ("start_mode", "next_mode", "mode_voltage", "margin", "successor")
 

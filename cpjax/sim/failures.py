@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cpjax.compilation import part_of_step
+from cpjax.backend.single_kernel import part_of_step
 from cpjax.pytree import Scalar
 from cpjax.sim import plants
 from cpjax.sim.flags import STOPPED, Flag

@@ -14,8 +14,8 @@ class Flag(enum.IntFlag):
     """Bits of `Trajectory.flag` and `Metrics.flag`; 0 is a clean run."""
 
     RUNAWAY = 1
-    """The state left, or was about to leave, the bounds of `cpjax.state` (RUNAWAY_LIMIT, ANGLE_LIMIT). It was held at
-    its last value inside."""
+    """The state left, or was about to leave, the bounds of the plant (`limits`). It was held at its last value
+    inside."""
 
     NON_FINITE = 2
     """A parameter or the next state was NaN or infinite. The state was held at its last finite value."""

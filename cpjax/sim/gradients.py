@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from cpjax.errors import InputError
+from cpjax.plant.state import State
 from cpjax.sim.initial import checked_tree
-from cpjax.state import State
 
 Direction: TypeAlias = Literal["reverse", "forward"]
 Objective: TypeAlias = Callable[[Any, State], jax.Array]

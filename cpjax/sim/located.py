@@ -13,18 +13,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cpjax.compilation import one_function, part_of_step
+from cpjax.backend.single_kernel import one_function, part_of_step
+from cpjax.checks import call
 from cpjax.errors import InputError
-from cpjax.returned import call
 from cpjax.sim import failures, plants
 from cpjax.sim.closed_loop import GATE_CROSSING, ContinuousLoop, HeldLoop, HeldMode, System
 from cpjax.sim.control import Control, start_control, update_control
 from cpjax.sim.flags import CHATTER_LENGTH, Flag, unknown
 from cpjax.sim.integrators import INTEGRATORS, Integrator
-from cpjax.sim.kept import pack
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.per_step import sees_the_voltage, start_metric, update_metric
 from cpjax.sim.plants import Plant, Tree
+from cpjax.sim.saved import pack
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
 from cpjax.sim.switching import LANDED, RUN, Motion, iterate, observe, pick, start_motion

@@ -13,18 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
-from cpjax import runtime
-from cpjax.compilation import one_function, part_of_step
+from cpjax.backend import runtime
+from cpjax.backend.single_kernel import one_function, part_of_step
+from cpjax.checks import call, like
 from cpjax.pytree import cast
-from cpjax.returned import call, like
 from cpjax.sim import failures, plants
 from cpjax.sim.control import Control, start_control, update_control
 from cpjax.sim.derivatives import shifted
 from cpjax.sim.flags import CHATTER_LENGTH, IN_DOUBT, Flag, unknown
 from cpjax.sim.integrators import INTEGRATORS
-from cpjax.sim.kept import pack
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.plants import Plant, Tree
+from cpjax.sim.saved import pack
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
 from cpjax.sim.stepper import applied_voltage, step_continuous, step_held, step_held_incremental

@@ -9,9 +9,9 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import jax
 import jax.numpy as jnp
 
+from cpjax.checks import call, like, pair, real
 from cpjax.errors import InputError
 from cpjax.pytree import Scalar
-from cpjax.returned import call, like, pair, real
 
 Tree: TypeAlias = Any
 """A pytree of scalars."""

@@ -28,9 +28,9 @@ from cpjax.sim import located, per_step
 from cpjax.sim.derivatives import may_switch, watched
 from cpjax.sim.flags import IN_DOUBT
 from cpjax.sim.initial import checked_initial
-from cpjax.sim.kept import Kept, fields, keep
 from cpjax.sim.metrics import Fold, NoMetrics, ProtocolMetrics, Sample
 from cpjax.sim.plants import Plant, Tree, check_plant, has_events
+from cpjax.sim.saved import Kept, fields, keep
 from cpjax.sim.settings import Settings, Simulation, check_names, check_settings
 
 

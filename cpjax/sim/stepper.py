@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from cpjax.compilation import part_of_step
+from cpjax.backend.single_kernel import part_of_step
 from cpjax.controllers.protocol import ModalController, demand
 from cpjax.pytree import Scalar
 from cpjax.sim import plants

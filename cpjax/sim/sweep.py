@@ -17,16 +17,16 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from cpjax import runtime
+from cpjax.backend import runtime
 from cpjax.controllers.protocol import Controller, Law, ModalController
 from cpjax.errors import InputError
 from cpjax.pytree import is_traced
 from cpjax.sim.flags import IN_DOUBT
 from cpjax.sim.initial import component_names
-from cpjax.sim.kept import Kept
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.rollout import prepared, results, simulate
+from cpjax.sim.saved import Kept
 from cpjax.sim.settings import Settings, Simulation, check_names
 
 Progress = Callable[[int, int], None]

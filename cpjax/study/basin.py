@@ -12,9 +12,9 @@ import numpy as np
 
 from cpjax.errors import InputError
 from cpjax.numeric.statistics import wilson_interval
+from cpjax.plant.state import NAMES, UNITS, State
 from cpjax.pytree import Number
 from cpjax.sim.metrics import Metrics
-from cpjax.state import NAMES, UNITS, State
 
 MOST_CELLS = 4096
 """Along one axis."""

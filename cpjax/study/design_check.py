@@ -10,7 +10,8 @@ import numpy as np
 from cpjax import io
 from cpjax.controllers import AngleGate, AngleRateGate, LyapunovGate, StateFeedback
 from cpjax.controllers.gates import Gate
-from cpjax.design.limits import (
+from cpjax.errors import InputError
+from cpjax.linear.limits import (
     demanded_voltage,
     level_within_angle,
     level_within_angle_and_rate,
@@ -19,11 +20,10 @@ from cpjax.design.limits import (
     lyapunov_function,
     saturation_angle,
 )
-from cpjax.design.margins import Margins, closed_loop_poles, margins
-from cpjax.design.structure import POSITION_AND_ANGLE, Structure, controllability, observability
-from cpjax.errors import InputError
+from cpjax.linear.margins import Margins, closed_loop_poles, margins
+from cpjax.linear.structure import POSITION_AND_ANGLE, Structure, controllability, observability
 from cpjax.plant import CartPole, linearize
-from cpjax.state import NAMES
+from cpjax.plant.state import NAMES
 
 
 @dataclasses.dataclass(frozen=True)

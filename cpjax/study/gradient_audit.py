@@ -21,13 +21,13 @@ from cpjax.controllers import Hybrid, SmoothClip, SmoothHybrid
 from cpjax.errors import InputError
 from cpjax.numeric.differences import Differences, central_differences
 from cpjax.plant import CartPole
+from cpjax.plant.state import NAMES, State
 from cpjax.pytree import is_traced
 from cpjax.sim.flags import STOPPED, describe
 from cpjax.sim.initial import checked_initial
 from cpjax.sim.metrics import Fold, TimeOutside
 from cpjax.sim.rollout import measure
 from cpjax.sim.settings import check_settings
-from cpjax.state import NAMES, State
 from cpjax.study.gradient_probe import Probe, Prober
 from cpjax.study.named_parameters import Build, Numbers, as_matrix, as_tree, whole_changes
 

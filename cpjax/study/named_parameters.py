@@ -11,9 +11,9 @@ import numpy as np
 
 from cpjax.controllers import Hybrid, LqrWeights, PoleFactors, StateFeedback
 from cpjax.controllers.protocol import Controller, Law
-from cpjax.design.lqr import lqr
-from cpjax.design.placement import place_polynomial
 from cpjax.errors import InputError
+from cpjax.linear.lqr import lqr
+from cpjax.linear.placement import place_polynomial
 from cpjax.plant import CartPole, linearize, with_parameters
 from cpjax.pytree import numbers
 

@@ -11,12 +11,12 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 
+from cpjax.backend.extremes import larger
 from cpjax.errors import InputError
-from cpjax.numeric.extremes import larger
 from cpjax.plant import CartPole
+from cpjax.plant.state import State
 from cpjax.pytree import Scalar, number, part, pytree
 from cpjax.sim.metrics import Fold, Sample, TimeOutside
-from cpjax.state import State
 
 
 class _Integral:

@@ -8,9 +8,9 @@ from typing import Any
 import jax
 
 from cpjax.errors import InputError
+from cpjax.plant.initial_states import START_SETS
 from cpjax.pytree import Number
 from cpjax.sim.settings import check_settings
-from cpjax.starts import START_SETS
 from cpjax.tune.objective import Aggregate, Goal, soft_maximum, success_weighted, tail_mean
 
 

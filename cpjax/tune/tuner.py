@@ -20,11 +20,11 @@ import optax
 from cpjax import io
 from cpjax.controllers import Hybrid, StateFeedback
 from cpjax.plant import CartPole, linearize
+from cpjax.plant.initial_states import sample_starts
+from cpjax.plant.state import State
 from cpjax.sim.flags import Flag
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import measure
-from cpjax.starts import sample_starts
-from cpjax.state import State
 from cpjax.tune import descent
 from cpjax.tune.checkpoint import Memory, restore, store
 from cpjax.tune.outcome import Tuning, request

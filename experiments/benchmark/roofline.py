@@ -12,8 +12,8 @@ import numpy as np
 
 from cpjax.controllers import AngleRateGate, EnergySwingUp, Hybrid, StateFeedback
 from cpjax.plant import CartPole
+from cpjax.plant.state import State
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
-from cpjax.state import State
 
 SOURCE = Path(__file__).with_name("roofline.c")
 FLAGS = ["-O3", "-march=native", "-ffp-contract=fast", "-fopenmp", "-shared", "-fPIC"]

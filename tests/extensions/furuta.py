@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 
 import cpjax
-from cpjax.numeric.extremes import larger, smaller
-from cpjax.numeric.trigonometry import sin_cos, wrap_angle
+from cpjax.backend.extremes import larger, smaller
+from cpjax.backend.trigonometry import sin_cos
+from cpjax.numeric.angles import wrap_angle
 from cpjax.pytree import Scalar, matrix, number, part, pytree
 
 

@@ -7,7 +7,7 @@ The impulse of a wall acts on the cart alone, so the pole's row of the equations
 import jax.numpy as jnp
 
 import cpjax
-from cpjax.numeric.trigonometry import sin_cos
+from cpjax.backend.trigonometry import sin_cos
 from cpjax.pytree import Scalar, number, part, pytree
 
 

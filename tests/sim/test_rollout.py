@@ -10,8 +10,8 @@ import pytest
 
 import cpjax
 from cpjax import REGULATE, SWING_UP, Flag, State, paper
+from cpjax.plant.state import RUNAWAY_LIMIT
 from cpjax.sim.flags import CHATTER_LENGTH, describe
-from cpjax.state import RUNAWAY_LIMIT
 
 PLANT = paper.appendix_plant()
 CENTRED = paper.controller("corrected-centred", "placement", PLANT)

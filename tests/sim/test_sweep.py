@@ -159,7 +159,8 @@ ON_DEVICES = """
 import sys, jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 import cpjax
-from cpjax import paper, runtime
+from cpjax import paper
+from cpjax.backend import runtime
 if sys.argv[1] == "configured":
     assert cpjax.configure_cpu(devices=8)
     assert runtime.fast_loops()

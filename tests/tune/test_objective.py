@@ -6,6 +6,7 @@ import pytest
 import cpjax
 from cpjax import paper
 from cpjax.errors import InputError
+from cpjax.tune.baseline import baseline
 from cpjax.tune.objective import (
     Effort,
     Goal,
@@ -17,10 +18,9 @@ from cpjax.tune.objective import (
     success_weighted,
     tail_mean,
 )
-from cpjax.tune.starting import beginning
 
 PLANT = paper.appendix_plant()
-LAW = beginning("bland", "lqr", PLANT)
+LAW = baseline("lqr", PLANT)
 START = cpjax.State(0.05, 0.0, 3.0, 0.1)
 RUN = {"duration": 3.0, "dt": 0.005}
 

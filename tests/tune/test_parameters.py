@@ -10,9 +10,10 @@ import cpjax
 from cpjax import paper
 from cpjax.controllers import AngleRateGate, EnergySwingUp, Hybrid, LqrWeights, LyapunovGate, PoleFactors, StateFeedback
 from cpjax.errors import InputError
+from cpjax.paper.initial import initial_controller
 from cpjax.plant import linearize
+from cpjax.tune.baseline import baseline
 from cpjax.tune.parameters import free_parameters
-from cpjax.tune.starting import beginning
 from cpjax.tune.tuner import fastest_pole_bound
 
 PLANT = paper.appendix_plant()
@@ -21,7 +22,7 @@ DESIGNS = ("lqr", "placement")
 
 @pytest.mark.parametrize(("design", "full_q"), [("lqr", False), ("lqr", True), ("placement", False)])
 def test_the_starting_vector_makes_the_controller_again(design, full_q):
-    begun = beginning("bland", design, PLANT)
+    begun = baseline(design, PLANT)
     free = free_parameters(begun, full_q=full_q)
     made = free.build(free.start())
     np.testing.assert_allclose(made.regulator.K, begun.regulator.K, rtol=1e-9)
@@ -32,7 +33,7 @@ def test_the_starting_vector_makes_the_controller_again(design, full_q):
 
 @pytest.mark.parametrize("design", DESIGNS)
 def test_any_vector_makes_a_stable_regulator_and_a_gate_within_its_range(design):
-    free = free_parameters(beginning("bland", design, PLANT))
+    free = free_parameters(baseline(design, PLANT))
     A, B = cpjax.linearize(PLANT)
     for vector in free.draw(np.random.default_rng(0), 20):
         made = free.build(jnp.asarray(vector))
@@ -42,7 +43,7 @@ def test_any_vector_makes_a_stable_regulator_and_a_gate_within_its_range(design)
 
 @pytest.mark.parametrize("design", DESIGNS)
 def test_gradients_pass_through_the_design(design):
-    free = free_parameters(beginning("bland", design, PLANT))
+    free = free_parameters(baseline(design, PLANT))
 
     def gain(vector):
         return jnp.sum(free.build(vector).regulator.K)
@@ -57,7 +58,7 @@ def test_gradients_pass_through_the_design(design):
 
 
 def test_a_lyapunov_gate_has_the_designs_own_form():
-    begun = beginning("bland", "lqr", PLANT)
+    begun = baseline("lqr", PLANT)
     found = begun.regulator.design.solve(*cpjax.linearize(PLANT))
     gated = Hybrid(begun.swing_up, begun.regulator, LyapunovGate(found.P, 50.0))
     free = free_parameters(gated)
@@ -66,7 +67,7 @@ def test_a_lyapunov_gate_has_the_designs_own_form():
 
 
 def test_zeros_start_small_and_frozen_names_stay():
-    free = free_parameters(beginning("paper", "lqr", PLANT), frozen=["energy_gain"])
+    free = free_parameters(initial_controller("paper", "lqr", PLANT), frozen=["energy_gain"])
     made = free.build(free.start())
     assert 0.0 < float(made.swing_up.cart_stiffness) < 0.1
     assert float(made.swing_up.energy_gain) == paper.ENERGY_GAIN
@@ -79,7 +80,7 @@ def test_zeros_start_small_and_frozen_names_stay():
 )
 def test_a_wrong_name_is_named(arguments, field):
     with pytest.raises(InputError) as caught:
-        free_parameters(beginning("bland", "lqr", PLANT), **arguments)
+        free_parameters(baseline("lqr", PLANT), **arguments)
     assert caught.value.field == field
 
 
@@ -90,7 +91,7 @@ def test_a_regulator_without_its_design_is_refused():
 
 
 def test_a_design_is_saved_beside_its_gain(tmp_path):
-    regulator = beginning("bland", "lqr", PLANT).regulator
+    regulator = baseline("lqr", PLANT).regulator
     cpjax.save(tmp_path / "law.json", regulator)
     loaded = cpjax.load(tmp_path / "law.json")
     assert isinstance(loaded.design, LqrWeights)
@@ -122,7 +123,7 @@ def test_the_pole_bound_is_a_bound_and_a_close_one():
 
 
 def test_a_small_weight_that_is_not_zero_is_kept():
-    begun = beginning("bland", "lqr", PLANT)
+    begun = baseline("lqr", PLANT)
     weights = dataclasses.replace(begun.regulator.design, R=1e-7, Q=np.diag([1e-9, 1.0, 1.0, 1.0]))
     law = dataclasses.replace(
         begun, regulator=dataclasses.replace(begun.regulator, design=weights, K=weights.solve(*linearize(PLANT)).K)
@@ -135,7 +136,7 @@ def test_a_small_weight_that_is_not_zero_is_kept():
 
 def test_half_angle_and_hysteresis_may_be_free_together():
     """The gate's rule: half_angle (1 + hysteresis) at most pi. The vector may be anything, the gate may not."""
-    begun = beginning("bland", "placement", PLANT)
+    begun = baseline("placement", PLANT)
     law = dataclasses.replace(begun, gate=AngleRateGate(1.5, 6.0, hysteresis=0.9))
     free = free_parameters(law, free=["half_angle", "hysteresis"])
     made = free.build(free.start())
@@ -148,8 +149,8 @@ def test_half_angle_and_hysteresis_may_be_free_together():
 
 def test_full_q_is_for_a_free_q():
     with pytest.raises(InputError, match="full_q"):
-        free_parameters(beginning("bland", "placement", PLANT), full_q=True)
-    begun = beginning("bland", "lqr", PLANT)
+        free_parameters(baseline("placement", PLANT), full_q=True)
+    begun = baseline("lqr", PLANT)
     Q = np.diag([10.0, 1.0, 10.0, 1.0])
     Q[0, 2] = Q[2, 0] = 1.0
     weights = dataclasses.replace(begun.regulator.design, Q=Q)
@@ -159,7 +160,7 @@ def test_full_q_is_for_a_free_q():
 
 
 def test_a_short_track_is_tried_with_gentler_pumping_too():
-    free = free_parameters(beginning("bland", "lqr", PLANT))
+    free = free_parameters(baseline("lqr", PLANT))
     random = np.random.default_rng(3)
     least = {short: np.min(free.draw(random, 4000, short_track=short)[:, 0]) for short in (False, True)}
     assert free.labels[0] == "energy_gain"
@@ -169,9 +170,9 @@ def test_a_short_track_is_tried_with_gentler_pumping_too():
 @pytest.mark.parametrize("name", ["bland", "paper"])
 @pytest.mark.parametrize("design", ["lqr", "placement"])
 def test_a_beginning_may_have_the_level_set_of_its_own_design(name, design):
-    made = beginning(name, design, PLANT, "lyapunov")
+    made = initial_controller(name, design, PLANT, "lyapunov")
     assert free_parameters(made).labels[-1] == "level"
     found = made.regulator.design.solve(*linearize(PLANT))
     np.testing.assert_array_equal(made.gate.P, found.P)
     with pytest.raises(InputError, match="gate"):
-        beginning(name, design, PLANT, "square")
+        initial_controller(name, design, PLANT, "square")

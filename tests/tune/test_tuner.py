@@ -8,11 +8,11 @@ import pytest
 
 from cpjax import paper
 from cpjax.errors import InputError
+from cpjax.tune.baseline import baseline
 from cpjax.tune.checkpoint import restore, store
 from cpjax.tune.parameters import free_parameters
 from cpjax.tune.plan import AGGREGATES, Plan
 from cpjax.tune.plants import UNCERTAIN, sample_plants
-from cpjax.tune.starting import beginning
 from cpjax.tune.tuner import _Tuner, tune
 
 PLANT = paper.appendix_plant()
@@ -24,7 +24,7 @@ SMALL = Plan(
 
 @pytest.fixture(scope="module")
 def tuner():
-    return _Tuner(PLANT, free_parameters(beginning("bland", "placement", PLANT)), SMALL)
+    return _Tuner(PLANT, free_parameters(baseline("placement", PLANT)), SMALL)
 
 
 @pytest.mark.slow
@@ -57,7 +57,7 @@ def test_a_checkpoint_of_another_tuning_is_refused(tuner, tmp_path):
 
 
 def test_candidates_are_compared_on_more_and_more_starts_and_the_given_controller_stays(monkeypatch):
-    free = free_parameters(beginning("bland", "placement", PLANT))
+    free = free_parameters(baseline("placement", PLANT))
     asked, seen = [], []
 
     def by_first_parameter(tuner, vectors, count, purpose):
@@ -77,7 +77,7 @@ def test_candidates_are_compared_on_more_and_more_starts_and_the_given_controlle
 
 @pytest.mark.slow
 def test_a_law_whose_crossings_cannot_be_located_scores_as_one_that_fails():
-    free = free_parameters(beginning("bland", "placement", PLANT))
+    free = free_parameters(baseline("placement", PLANT))
     scores = {}
     for spare in (0.0, 32.0):
         tuner = _Tuner(PLANT, free, dataclasses.replace(SMALL, spare_rate=spare, horizon=8.0))
@@ -92,7 +92,7 @@ def test_a_law_whose_crossings_cannot_be_located_scores_as_one_that_fails():
 def test_starts_are_drawn_anew_as_often_as_the_plan_says(resample, batches, monkeypatch):
     tuner = _Tuner(
         PLANT,
-        free_parameters(beginning("bland", "placement", PLANT)),
+        free_parameters(baseline("placement", PLANT)),
         dataclasses.replace(SMALL, resample=resample, validate_every=4, candidates=1, restarts=1),
     )
     seen = []

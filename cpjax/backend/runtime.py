@@ -1,0 +1,144 @@
+"""How JAX is to use a CPU: its cores as devices, and two options of XLA's compiler.
+
+By default XLA's CPU compiler makes several functions of one step of a simulation, computes what they share in each, and
+calls them one after the other: most of the time goes there. What `backend/single_kernel.py` does about it needs no
+options, but for values two of the compiler's do more:
+
+    xla_cpu_use_multi_output_fusion          what several results need is computed once
+    xla_cpu_small_while_loop_byte_threshold  a whole loop becomes one function
+
+They are not documented by XLA and have to be set before JAX starts, so a library cannot set them behind a user's back:
+`configure_cpu` does on request, and the command line does so for itself. They change speed, and results in the last
+bits. With a jaxlib that they were not tested with they are left out, and everything works without them.
+"""
+
+import functools
+import hashlib
+import os
+import platform
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.errors import InputError, PerformanceWarning
+
+TESTED = ("0.10.2",)
+"""The versions of jaxlib with which the options were tested."""
+
+_CONFIG: Any = jax.config  # its attributes have no annotations
+
+_OPTIONS = "xla_cpu_use_multi_output_fusion=true,xla_cpu_small_while_loop_byte_threshold=16777216"
+_FLAG = "--xla_backend_extra_options"
+
+
+def configure_cpu(devices: int | None = None, *, gradients: bool = False) -> bool:
+    """Makes simulations of many starts on a CPU fast. Call it before JAX computes anything, once.
+
+    By default it is for values: gradients are slower after it, those through a trajectory much slower
+    (docs/performance.md).
+
+    Args:
+      devices: as how many devices the CPU is to appear, which `sweep` shares its starts out to; by default as many as
+        there are cores that this process may use.
+      gradients: for a process that computes both. The cores become devices, and the compiler keeps its own options.
+
+    Returns:
+      Whether the compiler's options were set: not for gradients, with another jaxlib than the tested ones, or where
+      XLA_FLAGS has options of this kind already.
+
+    Raises:
+      InputError: `devices` below 1.
+      RuntimeError: JAX has started already, so that nothing can be set any more.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    devices = cores if devices is None else devices
+    if isinstance(devices, bool) or not isinstance(devices, int) or devices < 1:
+        raise InputError("devices", devices, "a whole number of devices, at least 1")
+    flags = os.environ.get("XLA_FLAGS", "")
+    try:
+        if "xla_force_host_platform_device_count" not in flags:
+            _CONFIG.update("jax_num_cpu_devices", devices)
+        else:  # which of the two holds is then XLA_FLAGS; this only asks whether JAX has started
+            _CONFIG.update("jax_num_cpu_devices", _CONFIG.jax_num_cpu_devices)
+    except RuntimeError as problem:
+        message = "configure_cpu is too late: JAX has started. Call it before anything is computed with JAX"
+        raise RuntimeError(message) from problem
+    if gradients or not is_tested() or _FLAG in flags:
+        return False
+    os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}={_OPTIONS}".strip()
+    return True
+
+
+def keep_compilations() -> Path | None:
+    """Has JAX keep on disk what it compiles, so that the next process need not; returns where, or None if it cannot.
+
+    In the user's cache folder ($XDG_CACHE_HOME or ~/.cache), unless JAX's own settings name another or forbid it.
+    """
+    folder = _CONFIG.jax_compilation_cache_dir
+    if not _CONFIG.jax_enable_compilation_cache:
+        return None
+    if folder is None:
+        # Compiled code is for one kind of CPU; a home may be seen by several.
+        kind = hashlib.sha256(_cpu().encode()).hexdigest()[:12]
+        cache = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+        folder = os.path.join(cache, "cpjax", kind)
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError:
+        return None
+    if not os.access(folder, os.W_OK):
+        return None
+    for name, value in (
+        ("jax_compilation_cache_dir", folder),
+        ("jax_persistent_cache_min_compile_time_secs", 0.1),
+        ("jax_persistent_cache_min_entry_size_bytes", 0),
+    ):
+        _CONFIG.update(name, value)
+    return Path(folder)
+
+
+def _cpu() -> str:
+    """What tells this CPU's instructions from another's."""
+    try:
+        with open("/proc/cpuinfo") as lines:
+            flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    except OSError:
+        flags = platform.processor()
+    return f"{platform.machine()} {flags}"
+
+
+@functools.cache
+def fast_loops() -> bool:
+    """Whether the compiler makes one function of a small loop; starts JAX. It is asked by compiling one."""
+    if jax.default_backend() != "cpu":
+        return False
+
+    def loop(x: jax.Array) -> jax.Array:
+        return jax.lax.fori_loop(0, 8, lambda _, y: jnp.sin(y) + y, x)
+
+    # 64 KiB: by default only loops over less than 1 KiB are made one function.
+    text = jax.jit(loop).lower(jnp.zeros((1 << 14,), jnp.float32)).compile().as_text() or ""
+    return "xla_cpu_small_call" in text
+
+
+@functools.cache
+def is_tested() -> bool:
+    """Whether jaxlib is a version with which all that XLA does not document was tested. Warns, once, if it is not."""
+    tested = version("jaxlib") in TESTED
+    if not tested:
+        message = (
+            f"jaxlib {version('jaxlib')} was not tested with cpjax's ways to make XLA fast on a CPU, so they are left "
+            f"out: expect simulations to be several times slower than with jaxlib {' or '.join(TESTED)}"
+        )
+        warnings.warn(message, PerformanceWarning, stacklevel=2)
+    return tested
+
+
+def compiler_options(platform: str) -> dict[str, Any]:
+    """Options for `jax.jit` of a function that simulates a batch."""
+    # The widest vectors that the CPU has; by default LLVM keeps to half of AVX-512's.
+    return {"xla_cpu_prefer_vector_width": 512} if platform == "cpu" else {}

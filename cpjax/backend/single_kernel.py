@@ -1,0 +1,218 @@
+"""How XLA's compiler for CPUs is told what to make one function of.
+
+By default it makes many small functions of one step of a simulation and calls them one by one at every step, which
+takes longer than the arithmetic. `one_function` ends that: a whole loop becomes one function. In that function several
+results with a common part each compute it for themselves, unless the part is a function too: `part_of_step`. (With the
+options that `cpjax.configure_cpu` sets, the compiler does both better by itself, and nothing is done here.)
+
+Both put attributes on the call of one `jax.jit` inside another. XLA does not document them: they are put there only
+for versions of jaxlib that they were tested with, and only around operations that they were tested with, which leaves
+out calls into other libraries (a solver, a callback). Only speed depends on them, and the last bits of results.
+"""
+
+import functools
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxlib.mlir import ir
+from jaxlib.mlir.dialects import func
+
+from cpjax.backend import runtime
+from cpjax.errors import PerformanceWarning
+from cpjax.pytree import hide, reveal
+
+LARGEST = 1 << 14
+"""Above so many numbers in a result, each operation of a loop is shared out to the cores, which is JAX's own way."""
+
+_ALLOWED = """
+func.func func.call func.return stablehlo.return stablehlo.while stablehlo.case stablehlo.if stablehlo.reduce
+stablehlo.abs stablehlo.add stablehlo.and stablehlo.atan2 stablehlo.bitcast_convert stablehlo.broadcast_in_dim
+stablehlo.cbrt stablehlo.ceil stablehlo.clamp stablehlo.compare stablehlo.concatenate stablehlo.constant
+stablehlo.convert stablehlo.cosine stablehlo.divide stablehlo.dynamic_slice stablehlo.dynamic_update_slice
+stablehlo.exponential stablehlo.exponential_minus_one stablehlo.floor stablehlo.iota stablehlo.is_finite
+stablehlo.log stablehlo.log_plus_one stablehlo.logistic stablehlo.maximum stablehlo.minimum stablehlo.multiply
+stablehlo.negate stablehlo.not stablehlo.or stablehlo.popcnt stablehlo.power stablehlo.remainder
+stablehlo.reshape stablehlo.reverse stablehlo.round_nearest_afz stablehlo.round_nearest_even stablehlo.rsqrt
+stablehlo.select stablehlo.shift_left stablehlo.shift_right_arithmetic stablehlo.shift_right_logical
+stablehlo.sign stablehlo.sine stablehlo.slice stablehlo.sqrt stablehlo.subtract stablehlo.tan stablehlo.tanh
+stablehlo.transpose stablehlo.xor
+"""
+"""Those operations that the compiler can write into one function."""
+
+
+def one_function(function: Callable[..., Any], *, stacks: bool = False) -> Callable[..., Any]:
+    """`function`, compiled as one function on a CPU: forward, and in each pass of a derivative.
+
+    To be called under `jax.jit`, with all that is differentiated among the arguments.
+
+    Args:
+      stacks: the function returns a pair, whose second part is stacked by a loop, and may be large.
+    """
+    return function if runtime.fast_loops() else _called(function, _whole, stacks)
+
+
+def part_of_step(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, as a function of its own where the compiler would otherwise compute what it does several times."""
+    return function if runtime.fast_loops() else _called(function, _part, False)
+
+
+class _Marks:
+    """Three identities. The first marks the call whose results it gets. The second, about a call's arguments, becomes
+    the third in a reverse pass: their cotangents are results of the call's transpose."""
+
+    def __init__(self, kind: str, mark: Callable[[Any, list[Any]], None]) -> None:
+        self.results: Any = Primitive(f"results_of_{kind}")
+        self.arguments: Any = Primitive(f"arguments_of_{kind}")
+        self.cotangents: Any = Primitive(f"cotangents_of_{kind}")
+        _define(self.results, self.results)
+        _define(self.arguments, self.cotangents)
+        _define(self.cotangents, self.arguments)
+
+        def lower(context: Any, *values: Any) -> list[Any]:
+            if max(aval.size for aval in context.avals_in) <= LARGEST and runtime.is_tested():
+                mark(context.module_context.symbol_table, [value.owner for value in values])
+            return list(values)
+
+        for primitive in (self.results, self.cotangents):
+            mlir.register_lowering(primitive, lower, platform="cpu", cacheable=False)
+
+
+def _called(function: Callable[..., Any], marks: _Marks, stacks: bool) -> Callable[..., Any]:
+    jitted = jax.jit(_revealed(function))
+
+    def called(*args: Any) -> Any:
+        results = jitted(*_bind(marks.arguments, hide(args)))
+        return (_bind(marks.results, results[0]), results[1]) if stacks else _bind(marks.results, results)
+
+    return called
+
+
+@functools.lru_cache(maxsize=256)
+def _revealed(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, of arguments that `hide` has been applied to. The same one each time, so that JAX traces it once."""
+
+    def revealed(*args: Any) -> Any:
+        return function(*reveal(args))
+
+    return functools.update_wrapper(revealed, getattr(function, "func", function))
+
+
+def _bind(primitive: Any, tree: Any) -> Any:
+    leaves, structure = jax.tree.flatten(tree)
+    return jax.tree.unflatten(structure, primitive.bind(*leaves)) if leaves else tree
+
+
+def _define(primitive: Any, transpose: Any) -> None:
+    def bind_nonzero(primitive: Any, tangents: Any) -> list[Any]:
+        values = list(tangents)
+        places = [place for place, value in enumerate(values) if type(value) is not ad.Zero]
+        if places:
+            for place, value in zip(places, primitive.bind(*[values[place] for place in places]), strict=True):
+                values[place] = value
+        return values
+
+    def jvp(primals: Any, tangents: Any) -> tuple[list[Any], list[Any]]:
+        return primitive.bind(*primals), bind_nonzero(primitive, tangents)
+
+    primitive.multiple_results = True
+    primitive.def_impl(lambda *values: list(values))
+    primitive.def_abstract_eval(lambda *values: list(values))
+    batching.primitive_batchers[primitive] = lambda values, axes: (primitive.bind(*values), axes)
+    ad.primitive_jvps[primitive] = jvp
+    ad.primitive_transposes[primitive] = lambda cotangents, *_: bind_nonzero(transpose, cotangents)
+    mlir.register_lowering(primitive, lambda _, *values: list(values))
+
+
+def _mark_part(_: Any, owners: list[Any]) -> None:
+    for owner in owners:
+        # XLA fails where it would share out the work of a function of one result to several cores.
+        if getattr(owner, "name", "") == "func.call" and len(owner.results) > 1:
+            owner.attributes["mhlo.frontend_attributes"] = _attributes("inlineable")
+
+
+def _mark_whole(symbols: Any, owners: list[Any]) -> None:
+    calls = [owner for owner in owners if getattr(owner, "name", "") == "func.call"]
+    for name in {call.attributes["callee"].value for call in calls}:
+        function = symbols[name]
+        if f"{name}_whole" in symbols:
+            continue
+        others = _others(function, symbols)
+        if not others:
+            _move_body(function, f"{name}_whole", symbols)
+        elif slow := sorted(others & _SLOW.keys()):
+            message = (
+                f"this simulation's loop contains {' and '.join(_SLOW[name] for name in slow)}, which keeps XLA from "
+                "compiling it as one function on a CPU: expect it to be several times slower. A small product of "
+                "matrices can be written as a sum over products of numbers (docs/performance.md)"
+            )
+            warnings.warn(message, PerformanceWarning, stacklevel=2)
+
+
+def _move_body(function: Any, name: str, symbols: Any) -> None:
+    """Makes of the function one that calls another, marked one, which has its body.
+
+    XLA fails on a marked function of which it simplifies an argument away. So the other returns its arguments too, and
+    a barrier hides which of them are constants.
+    """
+    inner = function.operation.clone(ip=ir.InsertionPoint(function.operation))
+    inner.attributes["sym_name"] = ir.StringAttr.get(name)
+    for attribute in ("arg_attrs", "res_attrs"):
+        if attribute in inner.attributes:
+            del inner.attributes[attribute]
+    block, outer = (operation.regions[0].blocks[0] for operation in (inner, function.operation))
+    end = block.operations[len(block.operations) - 1]
+    arguments, results = list(block.arguments), list(end.operands)
+    end.operation.erase()
+    kinds = [[value.type for value in values] for values in (arguments, [*results, *arguments])]
+    inner.attributes["function_type"] = ir.TypeAttr.get(ir.FunctionType.get(*kinds))
+    symbols.insert(inner)
+    for operation in reversed(list(outer.operations)):
+        operation.operation.erase()
+    with function.operation.location:
+        with ir.InsertionPoint(block):
+            func.ReturnOp([*results, *arguments])
+        with ir.InsertionPoint(outer):
+            given = list(outer.arguments)
+            hidden = ir.Operation.create("stablehlo.optimization_barrier", results=kinds[0], operands=given)
+            call = func.CallOp(kinds[1], ir.FlatSymbolRefAttr.get(name), list(hidden.results))
+            call.attributes["mhlo.frontend_attributes"] = _attributes("inlineable", "xla_cpu_small_call")
+            func.ReturnOp(list(call.results)[: len(results)])
+
+
+def _attributes(*names: str) -> Any:
+    values = {"inlineable": "false", "xla_cpu_small_call": "true"}
+    attributes: Any = {name: ir.StringAttr.get(values[name]) for name in names}
+    return ir.DictAttr.get(attributes)
+
+
+_SLOW = {
+    "stablehlo.dot_general": "a product of matrices",
+    "stablehlo.custom_call": "a call into another library (a solver, a callback)",
+    "stablehlo.sort": "a sort",
+}
+"""Operations that a user's law may bring in, in words."""
+
+
+def _others(function: Any, symbols: Any) -> set[str]:
+    """Returns the operations in the function, and in those it calls, that are not known to work."""
+    names = _ALLOWED.split()
+    waiting, known, others = [function], {function.attributes["sym_name"].value}, set()
+
+    def look(operation: Any) -> Any:
+        if operation.name == "func.call" and operation.attributes["callee"].value not in known:
+            known.add(operation.attributes["callee"].value)
+            waiting.append(symbols[operation.attributes["callee"].value])
+        if operation.name not in names:
+            others.add(operation.name)
+        return ir.WalkResult.ADVANCE
+
+    while waiting:
+        waiting.pop().operation.walk(look)
+    return others
+
+
+_whole, _part = _Marks("one_function", _mark_whole), _Marks("part_of_step", _mark_part)

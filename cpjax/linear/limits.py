@@ -1,0 +1,181 @@
+"""What the voltage limit and the gate leave of a linear design: where it saturates, and a region where it cannot fail.
+
+Inside the clip and the gate the loop is s' = A_K s to first order, and s' P s falls along it. The largest level set
+{s' P s <= level} that stays inside both is one that the linearised loop, once in, never leaves. It says so of the
+linear model; for the plant itself it is a guide, to be checked by rollouts.
+
+Every level asks for a P that is positive definite, and counts its symmetric part only; under jit, another gives NaN.
+"""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from cpjax.errors import InputError
+from cpjax.linear.arguments import MatrixLike, columns, gain_matrix, matrices, shaped, square
+from cpjax.linear.lyapunov import lyapunov
+from cpjax.numeric.small_matrices import is_positive_definite, linear_solve
+from cpjax.pytree import Number, Scalar, is_traced
+
+_THETA = 2  # where the angle stands in the state
+_RATE = 3
+
+
+def demanded_voltage(K: MatrixLike, angle: Scalar) -> jax.Array:
+    """Returns |u| [V] that the gain K (1, 4) or (4,) asks for at rest, cart in place, `angle` [rad] from upright."""
+    (K,) = matrices(K=K)
+    K = gain_matrix("K", K, 1, 4)
+    return jnp.abs(K[0, _THETA] * jnp.asarray(angle, dtype=K.dtype))
+
+
+def saturation_angle(K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
+    """Returns the angle [rad] from upright beyond which, at rest and with the cart in place, the gain K (1, 4) or (4,)
+    asks for more than `voltage_limit` [V]; infinite for a gain that ignores the angle.
+    """
+    (K,) = matrices(K=K)
+    K = gain_matrix("K", K, 1, 4)
+    return _limit("voltage_limit", "V", voltage_limit, K, infinite=True) / jnp.abs(K[0, _THETA])
+
+
+def lyapunov_function(A: MatrixLike, B: MatrixLike, K: MatrixLike, Q: MatrixLike) -> jax.Array:
+    """Returns P (n, n) for which d/dt s' P s = -s' Q s under s' = (A - B K) s.
+
+    Args:
+      A: (n, n).
+      B: (n, m), or (n,) for one input.
+      K: (m, n), or (n,) for one input.
+      Q: (n, n).
+
+    Raises:
+      InputError: shapes that do not fit, or a concrete closed loop that is not stable. Under jit P is NaN instead.
+    """
+    A, B, K, Q = matrices(A=A, B=B, K=K, Q=Q)
+    n = square("A", A)
+    B = columns("B", B, n)
+    K = gain_matrix("K", K, B.shape[1], n)
+    return lyapunov(A - B @ K, Q)
+
+
+def level_within_voltage(P: MatrixLike, K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
+    """The largest level at which |K s| stays within `voltage_limit` [V] wherever s' P s is at most that level.
+
+    P is (n, n), K (1, n) or (n,).
+
+    Raises:
+      InputError: shapes that do not fit, a concrete P that is not positive definite, or a limit that is not above 0.
+    """
+    P, K = matrices(P=P, K=K)
+    P = _positive_definite("P", P)
+    K = gain_matrix("K", K, 1, square("P", P))
+    limit = _limit("voltage_limit", "V", voltage_limit, P, infinite=True)
+    return limit * limit / (K @ linear_solve(P, K.T))[0, 0]
+
+
+def level_within_angle(P: MatrixLike, half_angle: Scalar) -> jax.Array:
+    """The largest level at which |theta| stays within `half_angle` [rad]: inside an AngleGate. P is (4, 4).
+
+    Raises:
+      InputError: see `level_within_voltage`; or an angle beyond pi.
+    """
+    (P,) = matrices(P=P)
+    P = _positive_definite("P", P, 4)
+    edge = _limit("half_angle", "rad", half_angle, P, at_most=math.pi)
+    return edge * edge / _spread(P, (_THETA,))[0, 0]
+
+
+def level_within_angle_and_rate(P: MatrixLike, half_angle: Scalar, rate: Scalar) -> jax.Array:
+    """The largest level inside an AngleRateGate: (1 - cos theta) / (1 - cos half_angle) + (theta' / rate)^2 <= 1.
+
+    P is (4, 4), half_angle in rad, rate in rad/s.
+
+    Raises:
+      InputError: see `level_within_angle`.
+    """
+    (P,) = matrices(P=P)
+    P = _positive_definite("P", P, 4)
+    half_angle = _limit("half_angle", "rad", half_angle, P, at_most=math.pi)
+    rate = _limit("rate", "rad/s", rate, P)
+    return _touching_level(_spread(P, (_THETA, _RATE)), half_angle, rate)
+
+
+@jax.jit
+def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -> jax.Array:
+    """The level at which the level set's shadow (2, 2) on angle and rate touches the gate's boundary."""
+    gate = jnp.linalg.inv(shadow), half_angle, rate
+    fixed = lax.stop_gradient(gate)  # the search is not differentiated; the last lines say where the derivative is from
+    # Positions are angles in the plane in which the shadow is about as wide as it is high: however far apart angle and
+    # rate are in size, the level changes over no small part of a turn.
+    ratio = half_angle * jnp.sqrt(shadow[1, 1]) / (rate * jnp.sqrt(shadow[0, 0]))
+
+    def level(position: jax.Array, form: jax.Array, half_angle: jax.Array, rate: jax.Array) -> jax.Array:
+        """At a point of the boundary, half of which is passed as `position` goes from 0 to pi."""
+        sin, cos = jnp.sin(position), ratio * jnp.cos(position)
+        length = jnp.hypot(sin, cos)
+        sin, cos = sin / length, cos / length
+        half_edge, half_cos = jnp.sin(0.5 * half_angle), jnp.cos(0.5 * half_angle)
+        angle = 2.0 * jnp.arctan2(half_edge * sin, jnp.hypot(half_cos, half_edge * cos))
+        point = jnp.stack([angle, rate * cos])
+        return point @ form @ point
+
+    def narrowed(_: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        middle, width = carry
+        positions = middle + width * jnp.linspace(-1.0, 1.0, 129, dtype=shadow.dtype)
+        return positions[jnp.argmin(jax.vmap(lambda position: level(position, *fixed))(positions))], width / 64.0
+
+    # The shadow touches the boundary where the level is smallest. A search on grids that narrow down copes with the
+    # corner that a half angle near pi gives the boundary.
+    quarter = jnp.asarray(0.5 * math.pi, dtype=shadow.dtype)
+    position, _ = lax.fori_loop(0, 5, narrowed, (quarter, quarter))
+    # By the envelope theorem the minimum's derivative is that at a fixed position. For the second one, the position
+    # moves as a step of Newton's method moves it; where the level is the same everywhere, it need not.
+    slope = jax.grad(level)
+    bend = jax.grad(slope)(position, *fixed)
+    step = slope(position, *gate) / jnp.where(bend > 0.0, bend, 1.0)
+    return level(position - jnp.where(bend > 0.0, step, 0.0), *gate)
+
+
+def level_within_form(P: MatrixLike, other: MatrixLike, level: Scalar) -> jax.Array:
+    """The largest level at which s' `other` s stays within `level`: inside a LyapunovGate of another P.
+
+    `other` is symmetric, of the shape of P; infinite where it is nowhere positive.
+
+    Raises:
+      InputError: see `level_within_voltage`.
+    """
+    P, other = matrices(P=P, other=other)
+    P = _positive_definite("P", P)
+    shaped("other", other, P.shape)
+    level = _limit("level", "1", level, P)
+    root = jnp.linalg.cholesky(P)
+    ratio = linear_solve(root, linear_solve(root, other).T)
+    return level / jnp.maximum(jnp.linalg.eigvalsh(0.5 * (ratio + ratio.T))[-1], 0.0)
+
+
+def _spread(P: jax.Array, chosen: tuple[int, ...]) -> jax.Array:
+    """The block of P^-1 whose inverse is the quadratic form of the level set's shadow on the chosen coordinates."""
+    columns = jnp.eye(P.shape[0], dtype=P.dtype)[:, jnp.asarray(chosen)]
+    return columns.T @ linear_solve(P, columns)
+
+
+_is_positive_definite = jax.jit(is_positive_definite)
+
+
+def _positive_definite(name: str, P: jax.Array, size: int | None = None) -> jax.Array:
+    """The symmetric part of a positive definite matrix; NaN for another that is traced."""
+    n = square(name, P)
+    shaped(name, P, (size or n,) * 2)
+    P = 0.5 * (P + P.T)
+    definite = _is_positive_definite(P)
+    if not is_traced(definite) and not definite:
+        raise InputError(name, P, "positive definite, by a margin that rounding leaves visible")
+    return jnp.where(definite, P, jnp.nan)
+
+
+def _limit(name: str, unit: str, value: Scalar, like: jax.Array, **ends: Any) -> jax.Array:
+    """A scalar above zero, in the dtype of `like`."""
+    limit = jnp.asarray(Number(unit, name, above=0.0, **ends).normalise(name, value), dtype=like.dtype)
+    shaped(name, limit, ())
+    return limit

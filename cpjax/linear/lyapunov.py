@@ -1,0 +1,151 @@
+"""Lyapunov's equation and its discrete-time counterpart, Stein's, for one matrix or a batch, differentiably.
+
+    A' X + X A + Q = 0            A' X A - X + Q = 0
+
+Both are solved by doubling (Smith, 1968): the sum of A'^k Q A^k over k, with twice as many terms after each step. It
+converges exactly when A is stable, so the iteration is also the test of stability. A correction with the residual in
+double-word arithmetic brings the result to the rounding of the exact solution where the equation's condition allows it.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from cpjax.errors import InputError
+from cpjax.linear.arguments import MatrixLike, matrices, shaped, square
+from cpjax.numeric import double_word as dw
+from cpjax.numeric.double_word import double_word
+from cpjax.numeric.small_matrices import (
+    Matrix,
+    accurate_product,
+    batch_last,
+    identity_like,
+    inverse,
+    largest,
+    log_abs_determinant,
+    product,
+    transpose,
+)
+from cpjax.pytree import is_traced
+
+_MOST_DOUBLINGS = 60
+_SMALL = 1e-12  # of the doubled A, when what is missing from the sum is of the order of its square
+
+
+class Sum(NamedTuple):
+    """X (n, n, ...), and whether A turned out to be stable (...); if not, X means nothing."""
+
+    X: Matrix
+    stable: jax.Array
+
+
+def lyapunov(A: MatrixLike, Q: MatrixLike) -> jax.Array:
+    """X (n, n) of A' X + X A + Q = 0 for a stable A, all of whose eigenvalues have negative real parts.
+
+    Differentiable to any order. Under jit, an unstable A gives NaN.
+
+    Args:
+      A: (n, n).
+      Q: (n, n), symmetric or not.
+
+    Raises:
+      InputError: shapes that do not fit, or a concrete A that is not stable.
+    """
+    return _solved(A, Q, lyapunov_equation, "of a stable system: every eigenvalue with a negative real part")
+
+
+def stein(A: MatrixLike, Q: MatrixLike) -> jax.Array:
+    """X (n, n) of A' X A - X + Q = 0 for a stable A, all of whose eigenvalues are inside the unit circle.
+
+    Differentiable to any order. Under jit, an unstable A gives NaN.
+
+    Args:
+      A: (n, n).
+      Q: (n, n), symmetric or not.
+
+    Raises:
+      InputError: shapes that do not fit, or a concrete A that is not stable.
+    """
+    return _solved(A, Q, stein_equation, "of a stable system: every eigenvalue inside the unit circle")
+
+
+def _solved(A: MatrixLike, Q: MatrixLike, equation: Callable[..., jax.Array], allowed: str) -> jax.Array:
+    A, Q = matrices(A=A, Q=Q)
+    shaped("Q", Q, (square("A", A),) * 2)
+    X = equation(A, Q)
+    if not is_traced(X) and np.any(np.isnan(X)):
+        raise InputError("A", A, allowed)
+    return X
+
+
+def lyapunov_equation(A: jax.Array, Q: jax.Array) -> jax.Array:
+    """`lyapunov` without its checks."""
+    return lax.custom_linear_solve(
+        lambda X: -(A.T @ X + X @ A),
+        Q,
+        lambda _, Q: _lyapunov(A, Q),
+        transpose_solve=lambda _, Q: _lyapunov(A.T, Q),
+    )
+
+
+def stein_equation(A: jax.Array, Q: jax.Array) -> jax.Array:
+    """`stein` without its checks."""
+    return lax.custom_linear_solve(
+        lambda X: X - A.T @ X @ A,
+        Q,
+        lambda _, Q: _stein(A, Q),
+        transpose_solve=lambda _, Q: _stein(A.T, Q),
+    )
+
+
+def sum_continuous(A: Matrix, Q: Matrix) -> Sum:
+    """Lyapunov's equation, matrix axes first: Cayley's transform makes it Stein's."""
+    shift = cayley_shift(A)
+    resolvent = inverse(shift * identity_like(A) - A)
+    discrete = 2.0 * shift * resolvent - identity_like(A)
+    return sum_discrete(discrete, 2.0 * shift * product(transpose(resolvent), Q, resolvent))
+
+
+def sum_discrete(A: Matrix, Q: Matrix) -> Sum:
+    """Stein's equation, matrix axes first."""
+
+    def unfinished(carry: tuple[Matrix, Matrix, jax.Array]) -> jax.Array:
+        _, power, count = carry
+        size = largest(power)
+        return jnp.any((size > _SMALL) & jnp.isfinite(size)) & (count < _MOST_DOUBLINGS)
+
+    def double(carry: tuple[Matrix, Matrix, jax.Array]) -> tuple[Matrix, Matrix, jax.Array]:
+        X, power, count = carry
+        return X + product(transpose(power), X, power), product(power, power), count + 1
+
+    X, power, _ = lax.while_loop(unfinished, double, (Q, A, jnp.zeros((), dtype=jnp.int32)))
+    return Sum(X, largest(power) <= _SMALL)
+
+
+def cayley_shift(A: Matrix) -> jax.Array:
+    """The geometric mean of |eigenvalues| (...), near which a shift makes doubling converge fastest."""
+    return jnp.exp(log_abs_determinant(A) / A.shape[0])
+
+
+@batch_last
+@jax.jit
+def _lyapunov(A: Matrix, Q: Matrix) -> Matrix:
+    X, stable = sum_continuous(A, Q)
+    a, x = double_word(A), double_word(X)
+    rest = dw.add(accurate_product(transpose(a), x), accurate_product(x, a))
+    more, _ = sum_continuous(A, dw.add(double_word(Q), rest).high)
+    return jnp.where(stable, X + more, jnp.nan)
+
+
+@batch_last
+@jax.jit
+def _stein(A: Matrix, Q: Matrix) -> Matrix:
+    X, stable = sum_discrete(A, Q)
+    a, x = double_word(A), double_word(X)
+    rest = dw.add(accurate_product(transpose(a), accurate_product(x, a)), dw.negative(x))
+    more, _ = sum_discrete(A, dw.add(double_word(Q), rest).high)
+    return jnp.where(stable, X + more, jnp.nan)

@@ -1,0 +1,19 @@
+"""Angles modulo a turn."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from cpjax.pytree import Scalar
+
+
+def wrap_angle(angle: Scalar) -> jax.Array:
+    """`angle` [rad] less the nearest whole number of turns: in [-pi, pi], give or take eps |angle|.
+
+    The derivative is 1 everywhere.
+    """
+    angle = jnp.asarray(angle)
+    turns = lax.round(angle * (0.5 / math.pi), lax.RoundingMethod.TO_NEAREST_EVEN)
+    return angle - turns * (2.0 * math.pi)  # lax.round has derivative zero

@@ -1,0 +1,48 @@
+"""The student paper that this project starts from: its plants, gains and laws, and what the package says about them.
+
+The application of the general packages; none of them imports it.
+"""
+
+from cpjax.paper.printed import (
+    ENERGY_GAIN,
+    LAWS,
+    PLANTS,
+    POLES,
+    PRINTED_GAINS,
+    SWITCH_ANGLE,
+    CorrectedSwingUpAsVoltage,
+    Design,
+    Gains,
+    PrintedSwingUp,
+    Q,
+    R,
+    appendix_plant,
+    computed_gain,
+    controller,
+    design_inputs,
+    identified_plant,
+    regulator,
+    riccati_solution,
+)
+
+__all__ = [
+    "ENERGY_GAIN",
+    "LAWS",
+    "PLANTS",
+    "POLES",
+    "PRINTED_GAINS",
+    "SWITCH_ANGLE",
+    "CorrectedSwingUpAsVoltage",
+    "Design",
+    "Gains",
+    "PrintedSwingUp",
+    "Q",
+    "R",
+    "appendix_plant",
+    "computed_gain",
+    "controller",
+    "design_inputs",
+    "identified_plant",
+    "regulator",
+    "riccati_solution",
+]

@@ -1,0 +1,212 @@
+"""Plants fitted to printed gains: least squares over chosen parameters, from many random starts at once.
+
+Gauss and Newton's method, damped by Levenberg and Marquardt, on derivatives through `linearize`, `lqr` and
+`place_polynomial`. Residuals are in units of the last printed digit.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from cpjax.numeric.small_matrices import linear_solve
+from cpjax.paper.printed_gains import PrintedGain
+from cpjax.plant import CartPole, Motor, parameter, parameters_of, with_parameters
+from cpjax.pytree import cast, numbers
+
+PARAMETERS = tuple(name for name, rule in numbers(CartPole, Motor).items() if rule.linear and rule.scales)
+"""Every number of a plant that its linear model may depend on, but for those that not every positive factor leaves in
+their range: a fit multiplies by any."""
+
+EXPLAINED = 1.0
+"""Worst residual, in units of the last digit, up to which gains count as explained: rounding twice is 1.0."""
+
+_STEPS = 40
+_LANES = 512  # fits that run side by side
+_START_FACTOR = 3.0
+Progress: TypeAlias = Callable[[int, int, str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """The best that changing some of a plant's parameters does for the gains.
+
+    Attributes:
+      parameters: which may change.
+      values: what they become.
+      residuals: computed less printed gain, in units of the last digit, all gains in a row.
+      reached: share of the random starts that end there (in cost, within 1 % or 0.01 of the best).
+    """
+
+    parameters: tuple[str, ...]
+    values: tuple[float, ...]
+    residuals: tuple[float, ...]
+    reached: float
+
+    @property
+    def worst(self) -> float:
+        """The largest residual, in units of the last digit."""
+        return max(abs(r) for r in self.residuals)
+
+    @property
+    def explains(self) -> bool:
+        """Whether every gain follows."""
+        return self.worst <= EXPLAINED
+
+
+def scale_of(plant: CartPole, name: str) -> float:
+    """The parameter's value; where it is zero, its typical size on this plant."""
+    return float(parameter(plant, name)) or parameters_of(plant)[name].size(plant) or 1.0
+
+
+def _residuals(prints: Sequence[PrintedGain], plant: CartPole) -> jax.Array:
+    gains = jnp.concatenate([p.computed(plant) for p in prints])
+    printed = jnp.asarray([k for p in prints for k in p.gain], dtype=gains.dtype)
+    return (gains - printed) / jnp.asarray([u for p in prints for u in p.unit], dtype=gains.dtype)
+
+
+def _with_derivatives(
+    prints: tuple[PrintedGain, ...], plant: CartPole, values: Callable[[jax.Array], Mapping[str, Any]], x: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Residuals (4 gains), and their derivatives (4 gains, n) by x (n,), on the plant changed to `values(x)`."""
+
+    def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        r = _residuals(prints, with_parameters(plant, values(x)))
+        return r, r
+
+    J, r = jax.jacfwd(twice, has_aux=True)(x)
+    return r, J
+
+
+# Compiled for all parameters, whichever are asked for: one program serves every audit of as many gains.
+
+
+def linearised(prints: tuple[PrintedGain, ...], plant: CartPole) -> tuple[Any, Any]:
+    """Residuals on `plant`, and their derivatives by all `PARAMETERS`, as NumPy arrays."""
+    r, J = _compiled_linearisation(prints, *_numbers(plant))
+    return np.asarray(r), np.asarray(J)
+
+
+@jax.jit
+def _compiled_linearisation(
+    prints: tuple[PrintedGain, ...], plant: CartPole, numbers: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    return _with_derivatives(prints, plant, lambda x: dict(zip(PARAMETERS, x, strict=True)), numbers)
+
+
+def _numbers(plant: CartPole) -> tuple[CartPole, jax.Array]:
+    """The plant with arrays for numbers, and the values of all `PARAMETERS`, of one dtype."""
+    numbers = jnp.asarray([float(parameter(plant, name)) for name in PARAMETERS])
+    return cast(plant, numbers.dtype), numbers
+
+
+def random_starts(sets: Sequence[tuple[str, ...]], most: int, count: int, seed: int) -> np.ndarray[Any, Any]:
+    """Logarithms of factors (sets, count, most); those beyond a set's size are not used."""
+    generator, spread = np.random.default_rng(seed), math.log(_START_FACTOR)
+    return generator.uniform(-spread, spread, (len(sets), count, most))
+
+
+def fit_all(
+    prints: tuple[PrintedGain, ...],
+    plant: CartPole,
+    sets: Sequence[tuple[str, ...]],
+    starts: np.ndarray[Any, Any],
+    progress: Progress | None,
+) -> list[Fit]:
+    """The best of all starts (sets, count, most) for each set of parameters."""
+    count, most = starts.shape[1:]
+    # Sets of any size in one program: an index beyond the last parameter stands for one less.
+    padded = [[*map(PARAMETERS.index, names), *[len(PARAMETERS)] * (most - len(names))] for names in sets]
+    chosen, x = np.repeat(padded, count, axis=0), starts.reshape(-1, most)
+    base = jnp.asarray([scale_of(plant, name) for name in PARAMETERS])
+    lanes = min(_LANES, len(x))
+    ends = []
+    for first in range(0, len(x), lanes):
+        if progress is not None:
+            text = f"sets of up to {most} parameters, {count} starts each"
+            progress(first // count, len(sets), text)
+        now = np.arange(first, first + lanes) % len(x)  # what the last round has too much is dropped below
+        ends.append(_fitted(prints, *_numbers(plant), base, chosen[now], jnp.asarray(x[now])))
+    found, rest = (np.concatenate(a)[: len(x)].reshape(len(sets), count, -1) for a in zip(*ends, strict=True))
+    cost = np.sum(rest**2, axis=-1)
+    fits = []
+    for row, names in enumerate(sets):
+        best = int(np.argmin(cost[row]))
+        lowest = cost[row, best]
+        agree = cost[row] <= lowest + max(0.01 * lowest, 0.01)
+        fits.append(
+            Fit(
+                names,
+                tuple(found[row, best, : len(names)].tolist()),
+                tuple(rest[row, best].tolist()),
+                float(np.mean(agree & np.isfinite(cost[row]))),
+            )
+        )
+    return fits
+
+
+@jax.jit
+def _fitted(
+    prints: tuple[PrintedGain, ...],
+    plant: CartPole,
+    own: jax.Array,
+    base: jax.Array,
+    chosen: jax.Array,
+    starts: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """The chosen parameters (lanes, most) and the residuals (lanes, 4 gains) where each start ends.
+
+    Args:
+      own: (parameters,) values of those that are not chosen.
+      base: (parameters,) what the exponentials of `starts` are factors of.
+      chosen: (lanes, most) indices into `PARAMETERS`, or their number for none.
+      starts: (lanes, most).
+    """
+    own, base = jnp.append(own, 1.0), jnp.append(base, 1.0)
+
+    def one(chosen: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def values(x: jax.Array) -> dict[str, jax.Array]:
+            numbers = own.at[chosen].set(base[chosen] * jnp.exp(x))
+            return dict(zip(PARAMETERS, numbers[:-1], strict=True))
+
+        end, rest = least_squares(lambda x: _with_derivatives(prints, plant, values, x), x, 4 * len(prints))
+        return base[chosen] * jnp.exp(end), rest
+
+    return jax.vmap(one)(chosen, starts)
+
+
+def least_squares(
+    residuals: Callable[[jax.Array], tuple[jax.Array, jax.Array]], x: jax.Array, count: int
+) -> tuple[jax.Array, jax.Array]:
+    """Minimises the residuals' sum of squares by Levenberg and Marquardt's method, from x (n,).
+
+    Args:
+      residuals: gives residuals (count,) and their derivatives (count, n).
+
+    Returns:
+      Where it ends (n,), and the residuals there (count,); these are infinite if they are not finite at the start.
+    """
+
+    def step(carry: tuple[Any, ...], _: None) -> tuple[Any, None]:
+        trial, best, damping = carry
+        r, J = residuals(trial)
+        tried = (jnp.sum(r * r), trial, r, J)
+        better = tried[0] < best[0]  # False for NaN
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, best)
+        damping = jnp.clip(jnp.where(better, damping / 5.0, damping * 4.0), 1e-12, 1e8)
+        _, x, r, J = best
+        H = J.T @ J
+        scale = jnp.diagonal(H)
+        damped = H + damping * jnp.diag(jnp.where(scale > 0.0, scale, 1.0))
+        # A relative change by more than e in one step leaves the region where a derivative means something.
+        return (x - jnp.clip(linear_solve(damped, (J.T @ r)[:, None])[:, 0], -1.0, 1.0), best, damping), None
+
+    unknown = jnp.full((count,), jnp.inf, dtype=x.dtype)
+    nowhere = (unknown[0], x, unknown, jnp.zeros((count, x.shape[0]), dtype=x.dtype))
+    (_, (_, x, rest, _), _), _ = lax.scan(step, (x, nowhere, jnp.asarray(5e-2, dtype=x.dtype)), length=_STEPS + 1)
+    return x, rest

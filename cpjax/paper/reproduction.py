@@ -1,0 +1,150 @@
+"""The paper's controllers, run fairly: every law on every plant with every gain, over one seeded set of starts."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from cpjax import io, paper
+from cpjax.controllers.hybrid import without_design
+from cpjax.errors import InputError
+from cpjax.plant.initial_states import check_starts, sample_starts
+from cpjax.plant.state import HANGING, State
+from cpjax.sim.metrics import Metrics
+from cpjax.sim.rollout import Trajectory, rollout
+from cpjax.sim.settings import check_settings
+from cpjax.sim.sweep import sweep
+from cpjax.study.summary import summarise
+
+DESIGNS: tuple[paper.Design, ...] = ("placement", "lqr")
+GAINS: tuple[paper.Gains, ...] = ("printed", "computed")
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """One controller on one plant."""
+
+    law: str
+    plant: str
+    design: paper.Design
+    gains: paper.Gains
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """How the protocol's evaluation runs are made: RK4, the sampled clock with one control instant a step.
+
+    Raises:
+      InputError: a value outside its range.
+    """
+
+    starts: str = "hanging"
+    count: int = 4096
+    seed: int = 1
+    duration: float = 20.0
+    dt: float = 0.002
+
+    def __post_init__(self) -> None:
+        check_settings(duration=self.duration, dt=self.dt)
+        check_starts(self.starts, self.count, self.seed)
+
+
+def variants() -> list[Variant]:
+    """All of them, in the order of the tables."""
+    return [Variant(*choice) for choice in itertools.product(paper.LAWS, paper.PLANTS, DESIGNS, GAINS)]
+
+
+def evaluate(variant: Variant, setting: Setting, starts: State | None = None) -> Metrics:
+    """Metrics of one variant over the setting's starts."""
+    plant = paper.PLANTS[variant.plant]()
+    controller = without_design(paper.controller(variant.law, variant.design, plant, variant.gains))
+    if starts is None:
+        starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
+    metrics: Metrics = sweep(
+        plant, without_design(controller), starts, duration=setting.duration, dt=setting.dt, clock="sampled"
+    )
+    return metrics
+
+
+def reproduce(
+    setting: Setting, *, progress: Callable[[int, int, str], None] | None = None, path: Path | None = None
+) -> list[dict[str, Any]]:
+    """One row per variant: the variant's names beside what `summarise` says of its metrics.
+
+    Args:
+      progress: called with the rows done, their number, and the next row in words.
+      path: where to save the rows after each of them (JSON). Rows of an interrupted run with the same setting and
+        versions, found there, are not computed again; after changing the code, choose another path.
+
+    Raises:
+      InputError: a `path` that cannot be written.
+    """
+    starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
+    todo = variants()
+    rows = _resume(path, setting) if path is not None else []
+    for variant in todo[len(rows) :]:
+        if progress is not None:
+            progress(len(rows), len(todo), f"{variant.law}, {variant.plant}, {variant.design}, {variant.gains}")
+        rows.append({**dataclasses.asdict(variant), **summarise(evaluate(variant, setting, starts))})
+        if path is not None:
+            io.write_json(path, _document(setting, rows))
+    if progress is not None:
+        progress(len(todo), len(todo), "done")
+    return rows
+
+
+def representative(law: str, plant: str, setting: Setting) -> tuple[str, State]:
+    """A start to show a law with both regulators by, with what it is in words.
+
+    Exactly hanging at rest, for a law that starts from there. For one that does not, of the starts that both catch with
+    the printed gains the one whose longer settling time is the median; or the set's first start if there is none.
+    """
+    if law.startswith("corrected") and law != "corrected-as-voltage":
+        return "exactly hanging at rest", HANGING
+    starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
+    both = [evaluate(Variant(law, plant, design, "printed"), setting, starts) for design in DESIGNS]
+    times = np.max([np.where(one.success, np.asarray(one.settling_time), np.inf) for one in both], axis=0)
+    successes = int(np.isfinite(times).sum())
+    index = int(np.argsort(times)[(successes - 1) // 2]) if successes else 0
+    words = "the median of those that both catch," if successes else "the first, for none is caught by both,"
+    start: State = jax.tree.map(lambda column: float(column[index]), starts)
+    return f"{words} of {setting.count} {setting.starts} starts (number {index + 1})", start
+
+
+def trajectory(law: str, design: paper.Design, plant: str, start: State, setting: Setting) -> Trajectory:
+    """One rollout with the printed gains, under the protocol."""
+    model = paper.PLANTS[plant]()
+    controller = paper.controller(law, design, model)
+    return rollout(model, controller, start, duration=setting.duration, dt=setting.dt, clock="sampled")
+
+
+def _document(setting: Setting, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "what": "the paper's controllers over a seeded set of starts",
+        "versions": io.versions(),
+        "setting": dataclasses.asdict(setting),
+        "complete": len(rows) == len(variants()),
+        "rows": rows,
+    }
+
+
+def _resume(path: Path, setting: Setting) -> list[dict[str, Any]]:
+    """Rows of an interrupted run with the same setting and versions."""
+    if not path.exists():
+        return []
+    try:
+        document = io.read_table(path)
+    except InputError:
+        return []  # something else, or broken: it is overwritten by the first row
+    expected = _document(setting, [])
+    same = all(document.get(key) == expected[key] for key in ("what", "versions", "setting"))
+    rows = document.get("rows")
+    if not same or document.get("complete", True) or not isinstance(rows, list) or len(rows) > len(variants()):
+        return []
+    expected_names = [dataclasses.asdict(variant) for variant in variants()[: len(rows)]]
+    found = [{key: dict(row).get(key) for key in names} for row, names in zip(rows, expected_names, strict=True)]
+    return rows if found == expected_names else []

@@ -1,0 +1,227 @@
+"""The plant: a cart with a pendulum, driven by a DC motor through its wheels.
+
+With M = cart_mass + reflected rotor mass, m = pole_mass, l = pole_length, J = pole_inertia, c = cart_friction,
+b = pivot_friction and F the horizontal force of the wheels, the Lagrangian
+
+    L = 1/2 M x'^2 + 1/2 m ((x' - l th' cos th)^2 + (l th' sin th)^2) + 1/2 J th'^2 - m g l cos th
+
+gives (paper, section III, with its sign error mended; see docs/paper.md)
+
+    (M + m) x'' - m l cos(th) th'' = F - c x' - m l sin(th) th'^2
+    (J + m l^2) th'' - m l cos(th) x'' = m g l sin(th) - b th'
+
+`CartPole.acceleration` is the only place that solves these for x'' and th''.
+"""
+
+import math
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.backend.trigonometry import LARGEST_TURN, sin_cos, turned
+from cpjax.checks import call, real
+from cpjax.plant.motor import Motor
+from cpjax.plant.state import ANGLE_LIMIT, NAMES, RUNAWAY_LIMIT, UNITS, State
+from cpjax.pytree import Number, Scalar, number, part, pytree
+
+Pair: TypeAlias = tuple[Scalar, Scalar]
+"""One number for the cart, one for the pole."""
+
+# Sizes at which a parameter that is zero would matter on a plant: declared below, at the fields.
+
+
+def _swing(plant: "CartPole") -> float:
+    """The inertia of a point bob about the pivot, m l^2."""
+    return float(plant.pole_mass) * float(plant.pole_length) ** 2
+
+
+def _pivot_damping(plant: "CartPole") -> float:
+    """That of a point bob of quality factor 1, m l^2 sqrt(g / l)."""
+    return _swing(plant) * math.sqrt(float(plant.gravity) / float(plant.pole_length))
+
+
+def _fifth_of_critical_damping(plant: "CartPole") -> float:
+    """Of the pendulum, 0.4 sqrt(m g l (J + m l^2))."""
+    weight = float(plant.pole_mass) * float(plant.gravity) * float(plant.pole_length)
+    return 0.4 * math.sqrt(weight * float(plant.pivot_inertia))
+
+
+@pytree
+class CartPole:
+    """Cart, pole and motor. Defaults: the paper's appendix (a point bob on a massless pole, no friction)."""
+
+    cart_mass: Scalar = number("kg", "mass of the cart, m_1", default=1.0, above=0.0, uncertain=True)
+    pole_mass: Scalar = number("kg", "mass of the pole, m_2", default=0.5, above=0.0, uncertain=True)
+    pole_length: Scalar = number("m", "pivot to the pole's centre of mass, l", default=0.7, above=0.0, uncertain=True)
+    gravity: Scalar = number("m/s^2", "gravity, g", default=9.81, above=0.0)
+    pole_inertia: Scalar = number(
+        "kg m^2", "pole inertia about its centre of mass, J", default=0.0, at_least=0.0, typical=_swing
+    )
+    cart_friction: Scalar = number(
+        "N s/m",
+        "viscous friction of the cart, c",
+        default=0.0,
+        at_least=0.0,
+        uncertain=True,
+        typical=lambda plant: plant.motor.damping,
+        change=0.1,
+    )
+    pivot_friction: Scalar = number(
+        "N m s/rad",
+        "viscous friction of the pivot, b",
+        default=0.0,
+        at_least=0.0,
+        uncertain=True,
+        typical=_pivot_damping,
+        drawn=_fifth_of_critical_damping,
+        change=0.01,
+    )
+    motor: Motor = part("a cpjax.Motor", "saturate", "force", "reflected_mass", default_factory=Motor)
+
+    @classmethod
+    def rod(cls, *, mass: Scalar, length: Scalar, **others: Any) -> "CartPole":
+        """A uniform rod of `mass` [kg] and whole `length` [m] on the pivot: l = length / 2, J = mass length^2 / 12.
+
+        Args:
+          others: the remaining fields of `CartPole`.
+        """
+        mass = Number("kg", "mass of the rod", above=0.0).normalise("CartPole.rod: mass", mass)
+        length = Number("m", "length of the rod", above=0.0).normalise("CartPole.rod: length", length)
+        return cls(pole_mass=mass, pole_length=length / 2, pole_inertia=mass * length * length / 12, **others)
+
+    @property
+    def limits(self) -> State:
+        """The largest magnitude of each component of the state; a rollout that goes beyond is stopped."""
+        return State(RUNAWAY_LIMIT, RUNAWAY_LIMIT, ANGLE_LIMIT, RUNAWAY_LIMIT)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the state's components, by name, for error messages."""
+        return dict(zip(NAMES, UNITS, strict=True))
+
+    @property
+    def input_limit(self) -> Scalar:
+        """The voltage at which the drive clips [V]."""
+        return self.motor.voltage_limit
+
+    def coordinates(self, state: State) -> tuple[Pair, Pair]:
+        """Returns positions (x, theta) and velocities (x', theta')."""
+        return (state.x, state.theta), (state.x_dot, state.theta_dot)
+
+    def state(self, q: Pair, v: Pair) -> State:
+        """Returns the state of positions (x, theta) and velocities (x', theta')."""
+        return State(q[0], v[0], q[1], v[1])
+
+    def saturate(self, command: Scalar) -> Scalar:
+        """Returns the terminal voltage [V] that the drive makes of a command: see `Motor.saturate`."""
+        return real("plant.motor.saturate", call("plant.motor", self.motor, "saturate", command))
+
+    def geometry(self, q: Pair) -> Pair:
+        """Returns sine and cosine of theta: all that the accelerations need of the positions."""
+        return sin_cos(q[1])
+
+    def geometry_near(self, geometry: Pair, change: Pair) -> tuple[Pair, jax.Array]:
+        """Returns sine and cosine after a `change` of the positions, and whether that is accurate to rounding."""
+        turn = jnp.asarray(change[1])
+        accurate = jnp.abs(turn) <= LARGEST_TURN
+        return turned(jnp.asarray(geometry[0]), jnp.asarray(geometry[1]), turn), accurate
+
+    def accelerations(self, geometry: Pair, v: Pair, u: Scalar) -> Pair:
+        """Returns (x'', theta'') [m/s^2, rad/s^2] under the applied voltage `u` [V].
+
+        Args:
+          geometry: sine and cosine of theta.
+          v: (x', theta') [m/s, rad/s].
+        """
+        force = real("plant.motor.force", call("plant.motor", self.motor, "force", u, v[0]))
+        return self.acceleration(*geometry, v, force)
+
+    def outputs(self, state: State, acceleration: Pair, u: Scalar) -> dict[str, Scalar]:
+        """Returns what a trajectory keeps beside state and voltage: x'' as `cart_acceleration` [m/s^2]."""
+        return {"cart_acceleration": acceleration[0]}
+
+    @property
+    def moving_mass(self) -> Scalar:
+        """Cart and reflected rotor together, M [kg]."""
+        return self.cart_mass + self.motor.reflected_mass
+
+    @property
+    def pivot_inertia(self) -> Scalar:
+        """The pole's inertia about its pivot, J + m l^2 [kg m^2]."""
+        return self.pole_inertia + self.pole_mass * self.pole_length * self.pole_length
+
+    def acceleration(
+        self, sin: Scalar, cos: Scalar, rates: tuple[Scalar, Scalar], force: Scalar
+    ) -> tuple[Scalar, Scalar]:
+        """Accelerations `(x'', theta'')` [m/s^2, rad/s^2]: the equations of motion in the module's docstring, solved.
+
+        Args:
+          sin: sine of theta.
+          cos: cosine of theta.
+          rates: `(x_dot, theta_dot)` [m/s, rad/s].
+          force: of the wheels on the cart [N].
+        """
+        x_dot, theta_dot = rates
+        m, inertia = self.pole_mass, self.pivot_inertia
+        ml = m * self.pole_length
+        push = force - self.cart_friction * x_dot - ml * theta_dot * theta_dot * sin
+        torque = ml * self.gravity * sin - self.pivot_friction * theta_dot
+        # (M + m)(J + m l^2) - (m l cos)^2, written as a sum of positive terms so that nothing cancels
+        determinant = (self.moving_mass + m) * self.pole_inertia + ml * self.pole_length * (
+            self.moving_mass + m * sin * sin
+        )
+        inverse = 1.0 / determinant  # a division takes as long as six multiplications
+        x_ddot = (inertia * push + ml * cos * torque) * inverse
+        theta_ddot = ((self.moving_mass + m) * torque + ml * cos * push) * inverse
+        return x_ddot, theta_ddot
+
+    def vector_field(self, state: State, voltage: Scalar) -> State:
+        """Time derivative of `state` under the applied (already clipped) terminal `voltage` [V]."""
+        sin, cos = sin_cos(state.theta)
+        force = self.motor.force(voltage, state.x_dot)
+        x_ddot, theta_ddot = self.acceleration(sin, cos, (state.x_dot, state.theta_dot), force)
+        return State(state.x_dot, x_ddot, state.theta_dot, theta_ddot)
+
+    def force_for_acceleration(self, state: State, x_ddot: Scalar) -> Scalar:
+        """Wheel force [N] under which the cart accelerates with `x_ddot` [m/s^2]: the equations of motion, inverted."""
+        sin, cos = sin_cos(state.theta)
+        ml = self.pole_mass * self.pole_length
+        torque = ml * self.gravity * sin - self.pivot_friction * state.theta_dot
+        theta_ddot = (ml * cos * x_ddot + torque) * (1.0 / self.pivot_inertia)
+        return (
+            (self.moving_mass + self.pole_mass) * x_ddot
+            - ml * cos * theta_ddot
+            + ml * sin * state.theta_dot * state.theta_dot
+            + self.cart_friction * state.x_dot
+        )
+
+    def kinetic_energy(self, state: State) -> Scalar:
+        """Of cart, rotor and pole [J]."""
+        _, cos = sin_cos(state.theta)
+        coupling = self.pole_mass * self.pole_length * cos * state.x_dot * state.theta_dot
+        cart = 0.5 * (self.moving_mass + self.pole_mass) * state.x_dot * state.x_dot
+        return cart - coupling + 0.5 * self.pivot_inertia * state.theta_dot * state.theta_dot
+
+    def potential_energy(self, state: State) -> Scalar:
+        """m g l cos(theta) [J]: zero at the pivot's height."""
+        _, cos = sin_cos(state.theta)
+        return self.pole_mass * self.gravity * self.pole_length * cos
+
+    def total_energy(self, state: State) -> Scalar:
+        """Kinetic and potential [J]."""
+        return self.kinetic_energy(state) + self.potential_energy(state)
+
+    def pendulum_energy(self, state: State) -> Scalar:
+        """Energy of the pole about a pivot at rest [J]; zero upright at rest, -2 m g l hanging at rest.
+
+        E = 1/2 (J + m l^2) theta'^2 + m g l (cos(theta) - 1)        (paper, section IV-C)
+        """
+        _, cos = sin_cos(state.theta)
+        weight = self.pole_mass * self.gravity * self.pole_length
+        return 0.5 * self.pivot_inertia * state.theta_dot * state.theta_dot + weight * (cos - 1.0)
+
+    def dissipated_power(self, state: State) -> Scalar:
+        """Power lost in the cart's and the pivot's friction [W]; the motor's own losses are inside the wheel force."""
+        cart = self.cart_friction * state.x_dot * state.x_dot
+        return cart + self.pivot_friction * state.theta_dot * state.theta_dot

@@ -1,0 +1,58 @@
+"""The plant's linear model about an equilibrium."""
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cpjax.errors import InputError
+from cpjax.plant.cartpole import CartPole
+from cpjax.plant.state import HANGING, UPRIGHT, State
+from cpjax.pytree import check, is_traced
+
+
+class LinearModel(NamedTuple):
+    """s' = A s + B u about an equilibrium, in the state order x, x_dot, theta, theta_dot."""
+
+    A: jax.Array
+    """Shape (4, 4)."""
+    B: jax.Array
+    """Shape (4, 1), per volt."""
+
+
+def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | State = "upright") -> LinearModel:
+    """A (4, 4) and B (4, 1) of the plant about an equilibrium with zero voltage, by forward differentiation.
+
+    Args:
+      equilibrium: "upright", "hanging", or a State at rest in which nothing accelerates (the cart may stand anywhere).
+
+    Raises:
+      InputError: `equilibrium` is another word, or a concrete State that is none.
+    """
+    if not isinstance(plant, CartPole):
+        raise InputError("plant", plant, "a cpjax.CartPole")
+    check("plant", plant)
+    named = {"upright": UPRIGHT, "hanging": HANGING}
+    if isinstance(equilibrium, str):
+        if equilibrium not in named:
+            raise InputError("equilibrium", equilibrium, "upright, hanging or a State")
+        equilibrium = named[equilibrium]
+    if not isinstance(equilibrium, State):
+        raise InputError("equilibrium", equilibrium, "upright, hanging or a State")
+
+    def field(vector: jax.Array, voltage: jax.Array) -> jax.Array:
+        return plant.vector_field(State.from_vector(vector), voltage).vector()
+
+    dtype = jnp.result_type(float, *(leaf for leaf in jax.tree.leaves(plant) if hasattr(leaf, "dtype")))
+    vector = jnp.asarray(equilibrium.vector(), dtype=dtype)
+    voltage = jnp.zeros((), dtype=dtype)
+    A, B = jax.jacfwd(field, argnums=(0, 1))(vector, voltage)
+    drift = field(vector, voltage)
+    if not is_traced(A) and not is_traced(drift):
+        if np.all(np.isfinite(vector)) and not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
+            raise InputError("plant", plant, "one with a finite linear model; no gain can be computed for this one")
+        # What A makes of a displacement by 1e-6: more than float32 misses pi by, less than a linear model would notice.
+        if not np.max(np.abs(drift)) <= 1e-6 * np.max(np.abs(A)):  # NaN is refused too
+            raise InputError("equilibrium", equilibrium, "a state at rest in which nothing accelerates")
+    return LinearModel(A, B[:, None])

@@ -1,0 +1,93 @@
+"""The drive: a DC motor without inductance, a gear and a wheel."""
+
+from typing import Any
+
+import jax
+
+from cpjax.backend.extremes import larger, smaller
+from cpjax.pytree import Scalar, number, pytree
+
+
+def _at_the_rotor(of_the_cart: float, plant: Any) -> Scalar:
+    """A mass or a damping of the cart as one of the rotor."""
+    return of_the_cart * (plant.motor.wheel_radius / plant.motor.gear_ratio) ** 2
+
+
+@pytree
+class Motor:
+    """A DC motor without inductance, a gear and a wheel that does not slip. Defaults: the paper's appendix.
+
+    Terminal voltage u gives the current i = (u - k_V n x' / r) / R, and the wheels push the cart with
+    F = n k_T i / r - n^2 B_m x' / r^2.
+    """
+
+    torque_constant: Scalar = number("N m/A", "torque per current, k_T", default=1.25, above=0.0, uncertain=True)
+    back_emf_constant: Scalar = number(
+        "V s/rad",
+        "voltage per rotor speed, k_V",
+        default=1.0,
+        at_least=0.0,
+        uncertain=True,
+        typical=lambda plant: plant.motor.torque_constant,
+        drawn=0.0,  # a motor without back-EMF is an idealisation, not one whose back-EMF happens to be small
+    )
+    resistance: Scalar = number("ohm", "resistance of the winding, R", default=1.25, above=0.0, uncertain=True)
+    rotor_inertia: Scalar = number(
+        "kg m^2",
+        "rotor inertia, J_m",
+        default=7e-6,
+        at_least=0.0,
+        typical=lambda plant: _at_the_rotor(float(plant.cart_mass), plant),
+    )
+    viscous_friction: Scalar = number(
+        "N m s/rad",
+        "bearing friction, B_m",
+        default=1e-5,
+        at_least=0.0,
+        typical=lambda plant: _at_the_rotor(float(plant.motor.damping), plant),
+    )
+    wheel_radius: Scalar = number("m", "wheel radius, r", default=1.0, above=0.0)
+    gear_ratio: Scalar = number("1", "rotor turns per wheel turn, n", default=1.0, above=0.0)
+    voltage_limit: Scalar = number(
+        "V", "supply: |u| is clipped here", default=12.0, above=0.0, infinite=True, linear=False
+    )
+
+    def saturate(self, voltage: Scalar) -> jax.Array:
+        """The demanded voltage [V] clipped to the supply. Derivative 1 inside, 0 outside, 1/2 exactly on the limit."""
+        return larger(-self.voltage_limit, smaller(self.voltage_limit, voltage))
+
+    def current(self, voltage: Scalar, x_dot: Scalar) -> Scalar:
+        """Current in the winding [A] at an applied voltage [V] and cart velocity [m/s]."""
+        return (voltage - self.back_emf_constant * self.gear_ratio / self.wheel_radius * x_dot) / self.resistance
+
+    def force(self, voltage: Scalar, x_dot: Scalar) -> Scalar:
+        """Horizontal force of the wheels on the cart [N].
+
+        F = (n k_T / (R r)) u - n^2 (B_m + k_T k_V / R) x' / r^2        (paper, section III; r = 1 m and n = 1 there)
+
+        Args:
+          voltage: terminal voltage [V], already clipped to the supply.
+          x_dot: cart velocity [m/s].
+        """
+        return self.force_per_voltage * voltage - self.damping * x_dot
+
+    def voltage_for_force(self, force: Scalar, x_dot: Scalar) -> Scalar:
+        """Terminal voltage [V] at which the wheels push with `force` [N] at cart velocity `x_dot` [m/s]; unclipped."""
+        return (force + self.damping * x_dot) * (1.0 / self.force_per_voltage)
+
+    @property
+    def force_per_voltage(self) -> Scalar:
+        """n k_T / (R r) [N/V]."""
+        return self.gear_ratio * self.torque_constant / (self.resistance * self.wheel_radius)
+
+    @property
+    def damping(self) -> Scalar:
+        """Bearing friction and back-EMF together, as a damping of the cart [N s/m]: n^2 (B_m + k_T k_V / R) / r^2."""
+        ratio = self.gear_ratio / self.wheel_radius
+        return ratio * ratio * (self.viscous_friction + self.torque_constant * self.back_emf_constant / self.resistance)
+
+    @property
+    def reflected_mass(self) -> Scalar:
+        """The rotor's inertia as a mass at the cart [kg]: n^2 J_m / r^2."""
+        ratio = self.gear_ratio / self.wheel_radius
+        return ratio * ratio * self.rotor_inertia

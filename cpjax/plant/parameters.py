@@ -1,0 +1,37 @@
+"""The numbers of a plant and its motor, by name."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from cpjax.errors import InputError
+from cpjax.plant.cartpole import CartPole
+from cpjax.pytree import Number, Scalar, numbers
+
+
+def parameters_of(plant: CartPole) -> dict[str, Number]:
+    """The declared numbers of a plant and its motor, by name, in order."""
+    return numbers(type(plant), type(plant.motor))
+
+
+def parameter(plant: CartPole, name: str) -> Scalar:
+    """The value of a number of the plant or of its motor."""
+    value: Scalar = getattr(plant if name in numbers(type(plant)) else plant.motor, name)
+    return value
+
+
+def with_parameters(plant: CartPole, values: Mapping[str, Any]) -> CartPole:
+    """The plant with some of its or its motor's numbers replaced.
+
+    Raises:
+      InputError: a name that neither declares, or a concrete value outside its range.
+    """
+    own, motor = numbers(type(plant)), numbers(type(plant.motor))
+    for name in values:
+        if name not in own and name not in motor:
+            raise InputError(name, values[name], "the value of one of " + ", ".join((*own, *motor)))
+    changes = {name: value for name, value in values.items() if name in own}
+    others = {name: value for name, value in values.items() if name not in own}
+    if others:
+        changes["motor"] = dataclasses.replace(plant.motor, **others)
+    return dataclasses.replace(plant, **changes)

@@ -1,0 +1,80 @@
+"""The state of cart and pendulum, and every convention about it.
+
+Order x, x_dot, theta, theta_dot. theta = 0 is upright, pi hangs down, and positive theta leans towards negative x: the
+pole's centre of mass is at (x - l sin(theta), l cos(theta)). Angles in rad, all else in SI units. theta is not wrapped
+while it evolves; whatever needs it modulo a turn says so.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from cpjax.numeric.angles import wrap_angle
+from cpjax.pytree import Number, Scalar, pytree
+
+NAMES = ("x", "x_dot", "theta", "theta_dot")
+UNITS = ("m", "m/s", "rad", "rad/s")
+
+
+@pytree
+class State:
+    """Four named scalars. Under `vmap` each becomes its own array, which is the layout that vector hardware wants.
+
+    A State also carries what has its shape: a time derivative, a reference, a tangent. It is therefore not checked
+    when constructed; `rollout` and `sweep` check the start they are given.
+
+    Attributes:
+      x: cart position [m].
+      x_dot: cart velocity [m/s].
+      theta: pole angle from upright [rad].
+      theta_dot: pole angular velocity [rad/s].
+    """
+
+    x: Scalar
+    x_dot: Scalar
+    theta: Scalar
+    theta_dot: Scalar
+
+    def vector(self) -> jax.Array:
+        """The state as an array (..., 4) in the order of `NAMES`."""
+        return jnp.stack([jnp.asarray(getattr(self, name)) for name in NAMES], axis=-1)
+
+    @classmethod
+    def from_vector(cls, vector: jax.Array) -> "State":
+        """The state held in the last axis of an array (..., 4)."""
+        return cls(*(vector[..., i] for i in range(4)))
+
+
+def deviation(state: State, reference: State) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """`state` less `reference`, in the order of `NAMES`, with the angle's difference taken modulo a turn."""
+    return (
+        state.x - reference.x,
+        state.x_dot - reference.x_dot,
+        wrap_angle(state.theta - reference.theta),
+        state.theta_dot - reference.theta_dot,
+    )
+
+
+def checked_reference(field: str, reference: State) -> State:
+    """A State that is a component's parameter, checked as its other parameters are.
+
+    Raises:
+      InputError: a component that is not a finite number.
+    """
+    components = zip(NAMES, UNITS, strict=True)
+    return State(*(Number(unit, n).normalise(f"{field}.{n}", getattr(reference, n)) for n, unit in components))
+
+
+UPRIGHT = State(0.0, 0.0, 0.0, 0.0)
+"""Balanced at rest in the middle of the track."""
+
+HANGING = State(0.0, 0.0, math.pi, 0.0)
+"""Hanging at rest in the middle of the track."""
+
+
+RUNAWAY_LIMIT = 1e3
+"""Bound on |x| [m], |x_dot| [m/s] and |theta_dot| [rad/s], far outside what 12 V can do in the protocol's 20 s."""
+
+ANGLE_LIMIT = 1e5
+"""Bound on |theta| [rad]; up to there sine and cosine of it mean something in float32."""

@@ -1,0 +1,1 @@
+"""Trade-offs between settling time and what it costs: fronts of controllers."""

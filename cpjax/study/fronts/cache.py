@@ -1,0 +1,50 @@
+"""What a search for trade-off fronts met and what it took, and its file: a search that is done is not done again."""
+
+import io as buffers
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cpjax import io
+from cpjax.study.fronts.evaluator import Judged
+
+_COUNTS = ("begun", "values", "gradients")
+
+
+class Search(NamedTuple):
+    """All by supply [V]."""
+
+    met: Mapping[float, Judged]
+    """Every controller that was judged by more than the screening."""
+    begun: Mapping[float, int]
+    """How many of them the candidates gave."""
+    values: Mapping[float, int]
+    """Runge-Kutta steps of values."""
+    gradients: Mapping[float, int]
+    """And of gradients."""
+    seconds: float
+    """Not by supply: what the search took."""
+
+
+def remembered(path: Path | None, search: Callable[[], Search]) -> Search:
+    """What the file holds, or else what `search` finds, then written there; no `path`, no file."""
+    if path is not None and path.exists():
+        with np.load(path) as archive:
+            columns = dict(archive)
+        supplies = columns["supplies"].tolist()
+        met = {supply: Judged(*(columns[f"{i}.{n}"] for n in Judged._fields)) for i, supply in enumerate(supplies)}
+        begun, values, gradients = (dict(zip(supplies, columns[name].tolist(), strict=True)) for name in _COUNTS)
+        return Search(met, begun, values, gradients, float(columns["seconds"]))
+    found = search()
+    if path is not None:
+        columns = {
+            f"{i}.{name}": of[name] for i, one in enumerate(found.met.values()) for of in [one._asdict()] for name in of
+        }
+        counts = {name: np.array([getattr(found, name)[supply] for supply in found.met]) for name in _COUNTS}
+        content: dict[str, Any] = {"supplies": np.array([*found.met]), "seconds": found.seconds, **counts, **columns}
+        buffer = buffers.BytesIO()
+        np.savez(buffer, **content)
+        io.write_bytes(path, buffer.getvalue())
+    return found

@@ -1,0 +1,287 @@
+"""What settling faster costs: trade-off fronts of a design, traced by gradients, and by random search for comparison.
+
+Every point is a hybrid controller. Random candidates, judged by values, are where the search begins. Then many tunings
+go side by side under one `vmap`: each minimises the time outside the target while the mean of one cost stays below a
+bound, for a ladder of bounds, every cost, and every supply (epsilon constraints, Haimes and others, 1971), by a price
+that rises while the cost exceeds its bound and falls while it does not (Arrow, Hurwicz and Uzawa, 1958). Now and then
+all are judged by the protocol's metrics, and each goes on from the fastest controller met so far that keeps to its
+bound. Of all that were judged, those that no other beats are the front. The random search draws candidates until it has
+simulated as many Runge-Kutta steps at each supply, a gradient's counted as the measured multiple of a value's.
+
+What is steered and what is judged differ: a price follows the mean cost of a few starts over a short run, on the
+continuous clock and failures included; a bound is kept by the mean over the successes, by the protocol.
+"""
+
+import dataclasses
+import functools
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from cpjax.controllers import DesignName
+from cpjax.numeric.pareto import hypervolume, nondominated
+from cpjax.plant import CartPole
+from cpjax.plant.state import State
+from cpjax.sim.metrics import TimeOutside
+from cpjax.sim.rollout import measure
+from cpjax.study.fronts.cache import Search, remembered
+from cpjax.study.fronts.config import COSTS, FrontPlan, Lane
+from cpjax.study.fronts.evaluator import BATCH, EXPLORE, FINAL, JUDGE, SEMIFINAL, Judge, Judged, layers, together
+from cpjax.study.fronts.reference_point import lanes
+from cpjax.tune import descent
+from cpjax.tune.objective import Effort, Jerkiness, PricedTime, Travel, Unfinished
+
+Numbers = np.ndarray[Any, Any]
+Report = Callable[[int, int, str], None]
+GRADIENT_STEP = 60.0
+"""Steps of the fastest values that take as long as one of a gradient of these tunings (`experiments/tuner_cost.py`)."""
+
+FOLDS: Mapping[str, Any] = {"effort": Effort(), "cart_travel": Travel(), "voltage_variation": Jerkiness()}
+"""What is differentiable of each of `COSTS`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Front:
+    """Of one cost, one supply and one way to search.
+
+    Attributes:
+      points: mean settling time [s] and mean cost (n, 2), over the successes among the last starts; by rising time.
+      success: share of those starts (n,).
+      vectors: the controllers' free parameters (n, d).
+      volume: the hypervolume up to the reference.
+      best_success: the greatest share of the semifinal's starts that any controller settled from.
+    """
+
+    points: Numbers
+    success: Numbers
+    vectors: Numbers
+    volume: float
+    best_success: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Fronts:
+    """Of one design.
+
+    Attributes:
+      traced: by gradients: (supply [V], cost) to front.
+      random: by random search, likewise.
+      steps: for each supply the Runge-Kutta steps of values and of gradients that the tracing took, and of the random
+        search.
+      seconds: that everything took, also what an interrupted call did before.
+    """
+
+    traced: dict[Lane, Front]
+    random: dict[Lane, Front]
+    steps: dict[float, dict[str, int]]
+    seconds: float
+
+
+def trace_fronts(
+    plant: CartPole,
+    design: DesignName,
+    plan: FrontPlan,
+    reference: Mapping[Lane, Numbers],
+    *,
+    supplies: tuple[float, ...] = (),
+    report: Report,
+    memory: Path | None = None,
+) -> Fronts:
+    """The fronts of settling time against every cost at the plant's own supply, and against effort at others.
+
+    Args:
+      reference: of the hypervolumes; see `front_yardstick`.
+      supplies: further voltage limits [V].
+      report: called with the parts done, their number, and what they are.
+      memory: a folder in which each of the two searches is saved when it is done. A call that finds one there goes on
+        from it; the folder is to be that of the same plant, design, plan and supplies.
+
+    Raises:
+      InputError: a plant without a voltage limit.
+    """
+    wanted = lanes(plant, supplies)
+    everywhere = list(dict.fromkeys(supply for supply, _ in wanted))
+    parts = plan.steps + len(everywhere) + 2 * len(wanted)
+    judge = Judge(plant, design, plan)
+
+    def trace() -> Search:
+        begin = time.perf_counter()
+        judge.steps = Counter()
+        report(0, parts, "screening candidates")
+        begun = {supply: judge.begin(supply, plan.candidates, 0) for supply in everywhere}
+        tracer = Tracer(judge, plan)
+        met = tracer.trace(begun, wanted, lambda done, text: report(done, parts, text))
+        counts = {supply: len(one.vectors) for supply, one in begun.items()}
+        return Search(met, counts, judge.steps, tracer.steps, time.perf_counter() - begin)
+
+    def draw() -> Search:
+        # For each supply as much work; as many as the tracing's are judged a second time, the rest goes into screening.
+        begin = time.perf_counter()
+        judge.steps = Counter()
+        drawn = {}
+        run = round(plan.horizon / plan.judging_dt)
+        for number, supply in enumerate(everywhere):
+            report(plan.steps + number, parts, f"random search of the same cost, {supply:g} V")
+            budget = traced.values[supply] + GRADIENT_STEP * traced.gradients[supply]
+            budget -= run * plan.judging * traced.begun[supply]
+            drawn[supply] = judge.begin(supply, max(1, int(budget / (run * plan.screening))), 1)
+        counts = {supply: len(one.vectors) for supply, one in drawn.items()}
+        return Search(drawn, counts, judge.steps, dict.fromkeys(everywhere, 0), time.perf_counter() - begin)
+
+    traced = remembered(memory and memory / "traced.npz", trace)
+    random = remembered(memory and memory / "random.npz", draw)
+    steps = {
+        supply: {
+            "values": traced.values[supply],
+            "gradients": traced.gradients[supply],
+            "random": random.values[supply],
+        }
+        for supply in everywhere
+    }
+
+    begin = time.perf_counter()
+    fronts: list[dict[Lane, Front]] = []
+    for which, found in enumerate((traced.met, random.met)):
+        fronts.append({})
+        for number, lane in enumerate(wanted):
+            report(parts - (2 - which) * len(wanted) + number, parts, "measuring the points")
+            fronts[-1][lane] = _front(judge, plan, found[lane[0]], *lane, reference[lane])
+    report(parts, parts, "done")
+    return Fronts(fronts[0], fronts[1], steps, traced.seconds + random.seconds + time.perf_counter() - begin)
+
+
+def _front(judge: Judge, plan: FrontPlan, met: Judged, supply: float, cost: str, reference: Numbers) -> Front:
+    """Of all controllers met, those that no other beats, measured once more from unseen starts."""
+    # Few starts say little about one failure in a hundred: who failed a few of them may run in the semifinal.
+    lenient = met.enough(1.0 - 3.0 * (1.0 - plan.success))
+    chosen = np.unique(np.concatenate([layers(met.points(cost, share), 3 * plan.bounds) for share in (1.0, lenient)]))
+    semifinal = judge.judge(met.vectors[chosen], supply, plan.semifinal, SEMIFINAL)
+    chosen = chosen[layers(semifinal.points(cost, plan.success), plan.bounds)]
+    final = judge.judge(met.vectors[chosen], supply, plan.final, FINAL)
+    points = final.points(cost, plan.success)
+    kept = nondominated(points)
+    return Front(
+        points[kept],
+        final.success[kept],
+        final.vectors[kept],
+        hypervolume(points[kept], reference),
+        float(np.max(semifinal.success)),
+    )
+
+
+class Aim(NamedTuple):
+    """What one tuning of many minimises, and on what."""
+
+    prices: jax.Array
+    """Of a unit of each of `COSTS` [s]; zero for all but one."""
+    supply: jax.Array
+    """[V]."""
+
+
+class Tracer:
+    """One design's tunings, side by side.
+
+    Attributes:
+      steps: Runge-Kutta steps of all gradients, by supply [V].
+      steps_of_a_run: those of one start.
+      gradient: slopes (n, d) and mean costs (n, number of `COSTS`) of controllers (n, d), aims (n,) and starts.
+    """
+
+    def __init__(self, judge: Judge, plan: FrontPlan) -> None:
+        self._judge, self._plan = judge, plan
+        self.steps: Counter[float] = Counter()
+        self._optimiser = optax.adam(optax.cosine_decay_schedule(plan.learning_rate, max(1, plan.steps), 0.1))
+        self._spare = math.ceil(plan.spare_rate * plan.duration)
+        self.steps_of_a_run = round(plan.duration / plan.dt) + self._spare
+        mesh = Mesh(np.array(jax.devices()), ("tunings",))
+        shared_out: Any = PartitionSpec("tunings")  # type: ignore[no-untyped-call]  # untyped in JAX
+        self._placed = functools.partial(jax.device_put, device=NamedSharding(mesh, shared_out))
+        same: Any = PartitionSpec()  # type: ignore[no-untyped-call]  # untyped in JAX
+        each = jax.vmap(self._slope, in_axes=(0, 0, None))
+        specs = {"in_specs": (shared_out, shared_out, same), "out_specs": shared_out}
+        self.gradient = jax.jit(jax.shard_map(each, mesh=mesh, check_vma=False, **specs))
+
+    def trace(
+        self, begun: dict[float, Judged], fronts: list[Lane], report: Callable[[int, str], None]
+    ) -> dict[float, Judged]:
+        """All controllers met, by supply: what `begun` has, and all that were judged on the way."""
+        plan = self._plan
+        jobs = [(supply, cost, bound) for supply, cost in fronts for bound in begun[supply].ladder(cost, plan)]
+        # Every device has as many tunings: the last is done more than once if need be.
+        jobs += [jobs[-1]] * (-len(jobs) % len(jax.devices()))
+        bounds = np.full((len(jobs), len(COSTS)), np.inf)
+        for row, (_, cost, bound) in enumerate(jobs):
+            bounds[row, COSTS.index(cost)] = bound
+        supplies = np.array([supply for supply, _, _ in jobs])
+        first = [begun[job[0]].fastest(*job[1:], plan.success, row % plan.variety)[0] for row, job in enumerate(jobs)]
+        vectors = self._placed(np.stack(first))  # as each step leaves them: otherwise the gradient is compiled twice
+        prices = np.where(np.isfinite(bounds), plan.price, 0.0)  # of a bound's worth of each cost
+        state = self._optimiser.init(vectors)
+        met = dict(begun)
+        random = np.random.default_rng([plan.seed, EXPLORE])
+        for step in range(plan.steps):
+            aims = Aim(jnp.asarray(prices / bounds, vectors.dtype), jnp.asarray(supplies, vectors.dtype))
+            slope, spent = self.gradient(vectors, aims, self._judge.starts(plan.batch, BATCH, step))
+            grown = prices * np.exp(plan.price_rate * (np.asarray(spent) / bounds - 1.0))
+            prices = np.where(prices > 0.0, np.clip(grown, plan.price / plan.dearest, plan.price * plan.dearest), 0.0)
+            vectors, state = descent.step(self._optimiser, vectors, state, slope)
+            each = plan.batch * self.steps_of_a_run
+            self.steps.update({supply: each * int(np.sum(supplies == supply)) for supply in met})
+            if (step + 1) % plan.judge_every == 0 or step + 1 == plan.steps:
+                times = np.full(len(jobs), np.inf)
+                for supply in met:
+                    rows = np.flatnonzero(supplies == supply)
+                    judged = self._judge.judge(np.asarray(vectors)[rows], supply, plan.judging, JUDGE)
+                    met[supply] = together([met[supply], judged])
+                    well = judged.success >= met[supply].enough(plan.success)
+                    kept = well & np.all(judged.costs <= bounds[rows], axis=1)
+                    times[rows] = np.where(kept, judged.time, np.inf)
+                if step + 1 >= plan.exchange_from * plan.steps:
+                    better = [met[supply].fastest(cost, bound, plan.success) for supply, cost, bound in jobs]
+                    jump = np.array([time < 0.98 * now for (_, time), now in zip(better, times, strict=True)])
+                    noise = plan.explore * (1.0 - (step + 1) / plan.steps) * random.standard_normal(vectors.shape)
+                    taken = np.stack([vector for vector, _ in better]) + noise
+                    vectors = jnp.where(jump[:, None], taken.astype(vectors.dtype), vectors)
+                    state = jax.tree.map(functools.partial(_forgotten, rows=jump), state)
+            report(step + 1, f"{len(jobs)} tunings side by side")
+        return met
+
+    def _slope(self, vector: jax.Array, aim: Aim, starts: State) -> tuple[jax.Array, jax.Array]:
+        """Of the mean over the starts, no start's sensitivity drowning the others'; and the mean costs."""
+        plan, plant, free = self._plan, self._judge.plant_at(aim.supply), self._judge.free_at(aim.supply)
+        costs = (FOLDS[cost] for cost in COSTS)
+        terms = (TimeOutside(plan.width, plan.width), *costs, Unfinished(plan.duration))
+        fold = PricedTime(terms, tuple(aim.prices), plan.fine)
+
+        def objective(vector: jax.Array, start: State) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+            found: tuple[jax.Array, tuple[jax.Array, ...]] = measure(
+                plant,
+                free.build(vector),
+                start,
+                duration=plan.duration,
+                dt=plan.dt,
+                switching="located",
+                spare_steps=self._spare,
+                metrics=fold,
+            )
+            return found
+
+        slopes, spent = jax.vmap(jax.grad(objective, has_aux=True), in_axes=(None, 0))(vector, starts)
+        sound = jnp.all(jnp.isfinite(slopes), axis=1)
+        slopes = jnp.where(sound[:, None], slopes, 0.0)
+        slope = jnp.mean(descent.shortened(slopes, sound, plan.clip)[:, None] * slopes, axis=0)
+        return slope, jnp.mean(jnp.nan_to_num(jnp.stack(spent, axis=1)), axis=0)
+
+
+def _forgotten(leaf: jax.Array, rows: Numbers) -> jax.Array:
+    """An optimiser's memory without that of some rows."""
+    return jnp.where(rows[:, None], 0.0, leaf).astype(leaf.dtype) if leaf.ndim == 2 else leaf
