@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tables import rows
 
 import cpjax
 from cpjax import (
@@ -88,7 +89,7 @@ REQUIRED = {
     StateFeedback: {"K": LAW.K},
     Hybrid: {"swing_up": LAW, "regulator": LAW, "gate": AngleGate(0.5)},
 }
-every_number = pytest.mark.parametrize(
+every_number = rows(
     ("cls", "field", "allowed", "unit"), NUMBERS, ids=[f"{cls.__name__}.{field}" for cls, field, _, _ in NUMBERS]
 )
 
@@ -134,7 +135,7 @@ def test_a_number_below_its_range_is_refused_and_its_ends_are_held(cls, field, a
 
 
 @every_number
-@pytest.mark.parametrize(
+@rows(
     ("value", "shown"),
     [
         (True, "True"),
@@ -157,13 +158,13 @@ def test_what_is_no_real_number_is_refused(cls, field, allowed, unit, value, sho
         build(cls, **{field: value})
 
 
-@pytest.mark.parametrize("text", ["a\nb", "a\r\nb", "\x1b[31m", "\x07", "a\u2028b"])
+@rows("text", ["a\nb", "a\r\nb", "\x1b[31m", "\x07", "a\u2028b"])
 def test_an_error_is_one_line_without_control_characters_whatever_was_given(text):
     for error in (InputError(text, 1, "x"), InputError("x", text, "x"), InputError("x", 1, text)):
         assert str(error).isprintable()
 
 
-@pytest.mark.parametrize("infinite", [(Motor, "voltage_limit"), (ProtocolMetrics, "track_limit")])
+@rows("infinite", [(Motor, "voltage_limit"), (ProtocolMetrics, "track_limit")])
 def test_the_two_limits_may_be_infinite(infinite):
     cls, field = infinite
     assert getattr(cls(**{field: math.inf}), field) == math.inf
@@ -174,7 +175,7 @@ def test_python_and_numpy_integers_are_welcome_where_a_number_is_meant():
     assert isinstance(CartPole(cart_mass=np.int64(2)).cart_mass, float)
 
 
-@pytest.mark.parametrize("cls", [AngleGate, AngleRateGate])
+@rows("cls", [AngleGate, AngleRateGate])
 def test_a_hysteresis_that_opens_an_angle_gate_beyond_half_a_turn_is_refused(cls):
     assert build(cls, half_angle=math.pi / 2, hysteresis=1.0).hysteresis == 1.0
     with refused(f"{cls.__name__}.hysteresis", "1.1", "small enough that half_angle * (1 + hysteresis) is at most pi"):
@@ -183,7 +184,7 @@ def test_a_hysteresis_that_opens_an_angle_gate_beyond_half_a_turn_is_refused(cls
         build(cls, half_angle=np.array([0.1, 3.0]), hysteresis=0.5)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("value", "shown"),
     [
         ([1.0, 2.0, 3.0], "'array of shape (3,)'"),
@@ -209,7 +210,7 @@ def test_a_gain_that_is_no_row_of_four_real_numbers_is_refused(value, shown):
         StateFeedback(value)
 
 
-@pytest.mark.parametrize("value", [["1", "2", "3", "4"], [True] * 4, [None] * 4], ids=["texts", "bools", "nones"])
+@rows("value", [["1", "2", "3", "4"], [True] * 4, [None] * 4], ids=["texts", "bools", "nones"])
 def test_a_gain_listed_in_other_things_than_numbers_is_refused(value):
     with refused("StateFeedback.K", "", "a finite array of shape (1, 4)"):
         StateFeedback(value)
@@ -218,7 +219,7 @@ def test_a_gain_listed_in_other_things_than_numbers_is_refused(value):
 ASYMMETRIC = np.eye(4) + np.triu(np.full((4, 4), 1e-3), 1)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("value", "shown"),
     [
         (ASYMMETRIC, "array([["),
@@ -240,7 +241,7 @@ def test_a_lyapunov_weight_that_is_no_symmetric_finite_matrix_is_refused(value, 
         LyapunovGate(value, level=1.0)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("cls", "field", "allowed"),
     [
         (CartPole, "motor", "a cpjax.Motor"),
@@ -253,13 +254,13 @@ def test_a_lyapunov_weight_that_is_no_symmetric_finite_matrix_is_refused(value, 
         (Hybrid, "gate", "a gate (with margin)"),
     ],
 )
-@pytest.mark.parametrize("value", [None, 1.0, "appendix", np.ones(4), {}, ProtocolMetrics()], ids=lambda v: str(v)[:8])
+@rows("value", [None, 1.0, "appendix", np.ones(4), {}, ProtocolMetrics()], ids=lambda v: str(v)[:8])
 def test_a_part_of_the_wrong_kind_is_refused(cls, field, allowed, value):
     with refused(f"{cls.__name__}.{field}", repr(value)[:20].split("\n")[0], allowed):
         build(cls, **{field: value})
 
 
-@pytest.mark.parametrize("x", [math.nan, math.inf, "1", None, True, 1j, [1.0]], ids=repr)
+@rows("x", [math.nan, math.inf, "1", None, True, 1j, [1.0]], ids=repr)
 def test_a_reference_that_is_no_state_of_finite_numbers_is_refused(x):
     with pytest.raises(InputError, match=r"reference.*\bx\b"):
         rollout(
@@ -267,14 +268,14 @@ def test_a_reference_that_is_no_state_of_finite_numbers_is_refused(x):
         )
 
 
-@pytest.mark.parametrize("cls", [CartPole, AngleGate, ProtocolMetrics])
+@rows("cls", [CartPole, AngleGate, ProtocolMetrics])
 def test_an_empty_batch_of_numbers_is_refused(cls):
     field = dataclasses.fields(cls)[0].name
     with refused(f"{cls.__name__}.{field}", "", "a finite number"):
         build(cls, **{field: np.ones(0)})
 
 
-@pytest.mark.parametrize(
+@rows(
     "use",
     [
         lambda: CartPole(cart_mass=HUGE),
@@ -291,7 +292,7 @@ def test_an_integer_too_large_for_a_float_is_refused(use):
         use()
 
 
-@pytest.mark.parametrize(
+@rows(
     ("arguments", "field", "allowed"),
     [
         ({"mass": -1, "length": 1}, "CartPole.rod: mass = -1.0", "above 0"),
@@ -315,8 +316,8 @@ def run(function=rollout, plant=PLANT, controller=LAW, start=HANGING, **settings
     return function(plant, controller, start, **{"duration": 0.1, "dt": 0.01, **settings})
 
 
-@pytest.mark.parametrize("function", [rollout, measure], ids=lambda f: f.__name__)
-@pytest.mark.parametrize(
+@rows("function", [rollout, measure], ids=lambda f: f.__name__)
+@rows(
     ("settings", "field", "value", "allowed"),
     [
         ({"dt": 0.2}, "dt", "0.2", "at most the duration, 0.1 s"),
@@ -347,7 +348,7 @@ def test_a_bad_setting_of_a_rollout_is_refused(function, settings, field, value,
         run(function, **settings)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("value", "allowed"),
     [
         (3, "a divisor of the number of steps, 10"),
@@ -361,7 +362,7 @@ def test_a_bad_save_every_is_refused(value, allowed):
         run(save_every=value)
 
 
-@pytest.mark.parametrize("name", ["dt", "duration", "control_period", "save_every", "clock", "switching", "integrator"])
+@rows("name", ["dt", "duration", "control_period", "save_every", "clock", "switching", "integrator"])
 def test_a_traced_setting_is_refused(name):
     def traced(value):
         return run(**{**SAMPLED, name: value}).flag
@@ -370,7 +371,7 @@ def test_a_traced_setting_is_refused(name):
         jax.jit(traced)(0.01)
 
 
-@pytest.mark.parametrize("field", ["dt", "duration", "control_period"])
+@rows("field", ["dt", "duration", "control_period"])
 def test_seconds_given_as_text_are_refused(field):
     with refused(field, "'0.1'", SECONDS):
         run(**{**SAMPLED, field: "0.1"})
@@ -381,7 +382,7 @@ def test_a_step_too_small_for_any_count_of_steps_is_refused():
         run(duration=1e300, dt=1e-300)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("start", "field", "value", "allowed"),
     [
         *((v, "start", repr(v)[:9], "a cpjax.State(x, x_dot, theta, theta_dot)") for v in (None, (0, 0, 0, 0), 1.0)),
@@ -413,7 +414,7 @@ def test_a_step_too_small_for_any_count_of_steps_is_refused():
     ],
     ids=lambda v: "",
 )
-@pytest.mark.parametrize("function", [rollout, measure], ids=lambda f: f.__name__)
+@rows("function", [rollout, measure], ids=lambda f: f.__name__)
 def test_a_start_that_is_no_state_of_four_finite_numbers_of_one_type_is_refused(function, start, field, value, allowed):
     with refused(field, value, allowed):
         run(function, start=start)
@@ -430,15 +431,15 @@ def test_a_start_beyond_the_range_of_its_type_is_refused():
         run(start=State(np.float32(0.0), 1e300, 0.0, 0.0))
 
 
-@pytest.mark.parametrize("function", [rollout, measure, sweep], ids=lambda f: f.__name__)
-@pytest.mark.parametrize("plant", [None, PLANT.motor, LAW, CartPole, "appendix", {}], ids=lambda v: repr(v)[:12])
+@rows("function", [rollout, measure, sweep], ids=lambda f: f.__name__)
+@rows("plant", [None, PLANT.motor, LAW, CartPole, "appendix", {}], ids=lambda v: repr(v)[:12])
 def test_a_plant_of_the_wrong_kind_is_refused(function, plant):
     start = State(np.ones(2), 0.0, 0.0, 0.0) if function is sweep else HANGING
     with refused("plant", repr(plant)[:12], "a cpjax.CartPole"):
         run(function, plant=plant, start=start)
 
 
-@pytest.mark.parametrize(
+@rows(
     "controller",
     [None, PLANT, PLANT.motor, AngleGate(0.5), "lqr", 1.0, lambda state: 0.0, Hybrid, StateFeedback],
     ids=lambda v: repr(v)[:24],
@@ -448,7 +449,7 @@ def test_a_controller_of_the_wrong_kind_is_refused(controller):
         run(controller=controller)
 
 
-@pytest.mark.parametrize("metrics", [1, "effort", PLANT, ProtocolMetrics, {}], ids=lambda v: repr(v)[:24])
+@rows("metrics", [1, "effort", PLANT, ProtocolMetrics, {}], ids=lambda v: repr(v)[:24])
 def test_metrics_that_are_no_fold_are_refused(metrics):
     with refused("metrics", repr(metrics)[:12], ""):
         run(metrics=metrics)
@@ -464,14 +465,14 @@ BATCHED = {
 }
 
 
-@pytest.mark.parametrize("arguments", BATCHED.values(), ids=BATCHED)
+@rows("arguments", BATCHED.values(), ids=BATCHED)
 def test_a_batched_component_without_vmap_is_refused(arguments):
     name = next(iter(arguments))
     with pytest.raises(InputError, match=rf"{name}\S* = 'array of shape \(3,( 1, 4)?\)?.*vmap"):
         run(**arguments)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("starts", "settings", "field", "value", "allowed"),
     [
         (
@@ -504,7 +505,7 @@ def test_a_bad_argument_of_a_sweep_is_refused(starts, settings, field, value, al
 # --- the other functions that take arguments --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@rows(
     ("arguments", "field", "value", "allowed"),
     [
         *(((v, 1, 1), "starts", repr(v), "one of hanging, anywhere, rest") for v in ("Hanging", "", None, 1, [])),
@@ -519,19 +520,19 @@ def test_bad_arguments_of_sample_starts_are_refused(arguments, field, value, all
         sample_starts(name, count, seed=seed)
 
 
-@pytest.mark.parametrize("dtype", [int, str, complex, "x"], ids=str)
+@rows("dtype", [int, str, complex, "x"], ids=str)
 def test_a_type_of_starts_that_no_rollout_takes_is_refused(dtype):
     with pytest.raises(InputError, match=r"dtype = .*: must be .*float32 or float64"):
         sample_starts("hanging", 2, seed=1, dtype=dtype)
 
 
-@pytest.mark.parametrize("count", [10**12, 10**30])
+@rows("count", [10**12, 10**30])
 def test_a_count_of_starts_that_fits_no_memory_is_refused(count):
     with refused("count", repr(count), "a whole number"):
         sample_starts("hanging", count, seed=1)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("arguments", "field", "value", "allowed"),
     [
         *(((1, v), "trials", repr(v), "a whole number, at least 1") for v in (0, -1, 3.5, math.inf, "3", None)),
@@ -548,7 +549,7 @@ def test_bad_arguments_of_the_wilson_interval_are_refused(arguments, field, valu
         wilson_interval(*arguments)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("arguments", "field"),
     [
         ((1, 0, 1, 3), "trials"),
@@ -566,7 +567,7 @@ def test_bad_arguments_of_the_two_proportion_test_are_refused(arguments, field):
         two_proportion_p_value(*arguments)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("arguments", "field", "value"),
     [
         ((PLANT, "up"), "equilibrium", "'up'"),
@@ -585,7 +586,7 @@ def test_bad_arguments_of_linearize_are_refused(arguments, field, value):
         linearize(*arguments)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("arguments", "field", "value", "allowed"),
     [
         (("printed", "lqr", PLANT), "law", "'printed'", "one of as-printed, corrected, corrected-as-voltage"),
@@ -657,7 +658,7 @@ def leaf_names(tree):
     return [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(tree)[0]]
 
 
-@pytest.mark.parametrize("name", leaf_names(OPEN))
+@rows("name", leaf_names(OPEN))
 def test_a_nan_in_the_plant_under_jit_is_flagged_and_no_success(name):
     metrics = hybrid_metrics(with_nan(OPEN, name), SWITCHING, AWAY)
     assert int(metrics.flag) == Flag.NON_FINITE
@@ -669,7 +670,7 @@ def test_a_nan_in_the_plant_under_jit_is_flagged_and_no_success(name):
 READ = [n for n in leaf_names(SWITCHING) if not n.endswith(("voltage_limit", "hysteresis"))]
 
 
-@pytest.mark.parametrize("name", READ)
+@rows("name", READ)
 def test_a_nan_in_the_controller_under_jit_is_flagged_and_no_success(name):
     start = NEAR if name.startswith((".regulator", ".gate")) else AWAY
     metrics = hybrid_metrics(OPEN, with_nan(SWITCHING, name), start)
@@ -684,8 +685,8 @@ def test_a_nan_in_the_start_under_jit_is_flagged_and_no_success():
         assert not bool(metrics.success)
 
 
-@pytest.mark.parametrize("clock", ["sampled", "continuous"])
-@pytest.mark.parametrize("gain", [1e3, 1e6, 1e12, 1e100, 1e150, 1e300])
+@rows("clock", ["sampled", "continuous"])
+@rows("gain", [1e3, 1e6, 1e12, 1e100, 1e150, 1e300])
 def test_a_hugely_stiff_gain_is_flagged_and_no_success_even_from_inside_the_bands(gain, clock):
     metrics = law_metrics(OPEN, StateFeedback(np.full(4, -gain)), NEAR, clock)
     assert int(metrics.flag) in (Flag.RUNAWAY, Flag.NON_FINITE)
@@ -710,8 +711,8 @@ def test_a_run_that_starts_outside_the_limits_is_flagged_at_once_and_held_there(
     assert set(np.asarray(result.state.x)) == {2e3}
 
 
-@pytest.mark.parametrize("clock", ["sampled", "continuous"])
-@pytest.mark.parametrize("gain", [1e3, 1e12, 1e150])  # with 1e300, d effort / d reference itself is beyond float64
+@rows("clock", ["sampled", "continuous"])
+@rows("gain", [1e3, 1e12, 1e150])  # with 1e300, d effort / d reference itself is beyond float64
 def test_the_gradient_of_a_flagged_run_is_finite_where_its_parameters_are(gain, clock):
     gradient, flag = law_gradient(OPEN, StateFeedback(np.full((1, 4), -gain)), NEAR, clock)
     assert int(flag) & STOPPED

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tables import rows
 
 from cpjax import (
     AngleGate,
@@ -92,8 +93,8 @@ THINGS = {
         metrics=METRICS,
     ),
 }
-every_thing = pytest.mark.parametrize("thing", THINGS.values(), ids=THINGS)
-both_formats = pytest.mark.parametrize("extension", ["json", "toml"])
+every_thing = rows("thing", THINGS.values(), ids=THINGS)
+both_formats = rows("extension", ["json", "toml"])
 
 
 def assert_bits(got, expected):
@@ -242,7 +243,7 @@ def test_a_smaller_array_type_written_by_hand_is_kept(tmp_path):
 # --- what is refused when read ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@rows(
     ("text", "field", "allowed"),
     [
         ('{"type": "CartPole", "mass": 1}', "key", "one of CartPole's fields: cart_mass, "),
@@ -293,19 +294,19 @@ def test_a_file_with_wrong_content_is_refused_with_its_path_and_key(tmp_path, te
     assert str(caught.value).startswith(str(path))
 
 
-@pytest.mark.parametrize("text", ["", "{", '{"type": "CartPole",}', '{"type": "CartPole"} x', "\x00", "[" * 100_000])
+@rows("text", ["", "{", '{"type": "CartPole",}', '{"type": "CartPole"} x', "\x00", "[" * 100_000])
 def test_broken_json_is_refused(tmp_path, text):
     with refused("path", "a valid JSON file ("):
         io.load(written(tmp_path, "thing.json", text))
 
 
-@pytest.mark.parametrize("text", ["type", "[motor", 'type = "CartPole"\ntype = "Motor"', "x = 2026-13-40", "\x00"])
+@rows("text", ["type", "[motor", 'type = "CartPole"\ntype = "Motor"', "x = 2026-13-40", "\x00"])
 def test_broken_toml_is_refused(tmp_path, text):
     with refused("path", "a valid TOML file ("):
         io.load(written(tmp_path, "thing.toml", text))
 
 
-@pytest.mark.parametrize("text", ["1", "null", "[]", '"CartPole"', "true"])
+@rows("text", ["1", "null", "[]", '"CartPole"', "true"])
 def test_json_that_holds_no_table_is_refused(tmp_path, text):
     with refused("path", "a file that holds one table"):
         io.load(written(tmp_path, "thing.json", text))
@@ -341,7 +342,7 @@ def test_a_folder_in_place_of_a_file_is_refused(tmp_path, extension):
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
-@pytest.mark.parametrize("name", ["plant.yaml", "plant", "plant.json.txt", ".json"])
+@rows("name", ["plant.yaml", "plant", "plant.json.txt", ".json"])
 def test_another_extension_is_refused_for_reading_and_writing(tmp_path, name):
     for use in (lambda path: io.save(path, PLANT), io.load):
         with refused("path", "a file name that ends in .json or .toml"):
@@ -365,7 +366,7 @@ def test_arrays_of_five_dtypes_are_read_and_no_other(tmp_path):
             io.load(written(tmp_path, "state.json", text % (dtype, "1")))
 
 
-@pytest.mark.parametrize(
+@rows(
     ("dtype", "values"),
     [
         ("int32", "1.5"),
@@ -386,7 +387,7 @@ def test_values_that_are_no_numbers_of_their_dtype_are_refused(tmp_path, dtype, 
         io.load(written(tmp_path, "gate.json", text))
 
 
-@pytest.mark.parametrize("dtype", [np.longdouble, np.float16, np.int8, np.uint32], ids=lambda d: d.__name__)
+@rows("dtype", [np.longdouble, np.float16, np.int8, np.uint32], ids=lambda d: d.__name__)
 @both_formats
 def test_an_array_that_no_file_could_give_back_is_not_written(tmp_path, dtype, extension):
     with refused("State.x", "of dtype bool, int32, int64, float32, float64"):
@@ -397,7 +398,7 @@ def test_an_array_that_no_file_could_give_back_is_not_written(tmp_path, dtype, e
 REST = '"x_dot": 0, "theta": 0, "theta_dot": 0'
 
 
-@pytest.mark.parametrize(
+@rows(
     ("name", "text", "field"),
     [
         ("a.json", f'{{"type": "State", "x": "left", {REST}}}', "State.x"),
@@ -413,8 +414,8 @@ def test_a_state_of_other_things_than_numbers_is_refused_by_name(tmp_path, name,
         io.load(written(tmp_path, name, text))
 
 
-@pytest.mark.parametrize("field", ["success", "effort", "flag"])
-@pytest.mark.parametrize("value", [None, "a text", {"type": "Motor"}], ids=str)
+@rows("field", ["success", "effort", "flag"])
+@rows("value", [None, "a text", {"type": "Motor"}], ids=str)
 def test_metrics_of_other_things_than_numbers_are_refused_by_name(tmp_path, field, value):
     table = {**io.encode(METRICS), field: value}
     io.write_json(tmp_path / "metrics.json", table)
@@ -422,9 +423,7 @@ def test_metrics_of_other_things_than_numbers_are_refused_by_name(tmp_path, fiel
         io.load(tmp_path / "metrics.json")
 
 
-@pytest.mark.parametrize(
-    ("field", "value"), [("state", 1.0), ("state", {"type": "Motor"}), ("metrics", "x"), ("time", {"type": "Motor"})]
-)
+@rows(("field", "value"), [("state", 1.0), ("state", {"type": "Motor"}), ("metrics", "x"), ("time", {"type": "Motor"})])
 def test_a_trajectory_of_other_parts_is_refused_by_name(tmp_path, field, value):
     io.write_json(tmp_path / "run.json", {**io.encode(THINGS["Trajectory"]), field: value})
     with refused(f"Trajectory.{field}"):
@@ -443,7 +442,7 @@ def test_a_result_of_a_command_is_no_component_but_has_parts(tmp_path):
 # --- what is refused when written -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("thing", [None, 1.0, {"type": "CartPole"}, CartPole, jnp.ones(3), io.TYPES], ids=lambda v: "")
+@rows("thing", [None, 1.0, {"type": "CartPole"}, CartPole, jnp.ones(3), io.TYPES], ids=lambda v: "")
 def test_what_is_no_component_is_refused(tmp_path, thing):
     with refused("thing", "one of State, Motor, CartPole"):
         io.save(tmp_path / "thing.json", thing)
@@ -467,7 +466,7 @@ def test_a_component_with_a_part_of_the_users_own_is_refused(tmp_path, extension
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("transform", [jax.jit, jax.vmap, jax.grad], ids=["jit", "vmap", "grad"])
+@rows("transform", [jax.jit, jax.vmap, jax.grad], ids=["jit", "vmap", "grad"])
 def test_a_component_that_jax_is_tracing_is_refused(tmp_path, transform):
     def use(mass):
         io.save(tmp_path / "thing.json", CartPole(cart_mass=mass))

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
+from tables import rows
 
 import cpjax
 from cpjax.show import animation
@@ -135,7 +136,7 @@ def test_without_an_encoder_a_film_becomes_a_page(command, tmp_path, monkeypatch
     assert (tmp_path / "animation.html").exists()
 
 
-@pytest.mark.parametrize(
+@rows(
     ("arguments", "named"),
     [
         (("basin", "--theta", "1", "-1"), "error: theta = "),

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from tables import rows
 
 from cpjax import (
     AngleGate,
@@ -53,7 +54,7 @@ THINGS = [
     HYBRID,
     ProtocolMetrics(track_limit=2.0),
 ]
-every_type = pytest.mark.parametrize("thing", THINGS, ids=lambda thing: type(thing).__name__)
+every_type = rows("thing", THINGS, ids=lambda thing: type(thing).__name__)
 
 
 def assert_same(got, expected):
@@ -71,40 +72,46 @@ def assert_close(got, expected, rtol, atol=0.0):
         np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=rtol, atol=atol)
 
 
-@every_type
 class TestEveryType:
+    @every_type
     def test_the_identity_map_keeps_type_and_leaves(self, thing):
         mapped = jax.tree.map(lambda leaf: leaf, thing)
         assert type(mapped) is type(thing)
         assert all(a is b for a, b in zip(jax.tree.leaves(mapped), jax.tree.leaves(thing), strict=True))
 
+    @every_type
     def test_a_map_to_none_builds_the_type_without_checking_it(self, thing):
         mapped = jax.tree.map(lambda leaf: None, thing)
         assert type(mapped) is type(thing)
         assert jax.tree.leaves(mapped) == []
 
+    @every_type
     def test_a_map_to_objects_builds_the_type_without_checking_it(self, thing):
         marker = object()
         mapped = jax.tree.map(lambda leaf: marker, thing)
         assert type(mapped) is type(thing)
         assert set(jax.tree.leaves(mapped)) == {marker}
 
+    @every_type
     def test_a_map_to_values_outside_their_range_builds_the_type_without_checking_it(self, thing):
         mapped = jax.tree.map(lambda leaf: -math.inf * np.ones(np.shape(leaf)), thing)
         assert jax.tree.structure(mapped) == jax.tree.structure(thing)
 
+    @every_type
     def test_a_map_to_float32_makes_every_leaf_a_float32_array_of_its_shape(self, thing):
         mapped = jax.tree.map(jnp.float32, thing)
         assert jax.tree.structure(mapped) == jax.tree.structure(thing)
         assert {leaf.dtype for leaf in jax.tree.leaves(mapped)} == {jnp.dtype("float32")}
         assert_close(mapped, thing, rtol=1e-7)
 
+    @every_type
     def test_flattening_and_unflattening_gives_the_same_thing(self, thing):
         leaves, structure = jax.tree.flatten(thing)
         again = jax.tree.unflatten(structure, leaves)
         assert type(again) is type(thing)
         assert_same(again, thing)
 
+    @every_type
     def test_paths_are_attribute_names_that_lead_to_their_leaf(self, thing):
         pairs, _ = jax.tree_util.tree_flatten_with_path(thing)
         for path, leaf in pairs:
@@ -116,20 +123,24 @@ class TestEveryType:
         given = [f.name for f in dataclasses.fields(thing) if getattr(thing, f.name) is not None]  # None is no leaf
         assert list(dict.fromkeys(path[0].name for path, _ in pairs)) == given
 
+    @every_type
     def test_two_things_that_differ_in_numbers_only_have_one_structure_and_one_hash(self, thing):
         other = jax.tree.map(lambda leaf: 2.0 * np.asarray(leaf), thing)
         assert jax.tree.structure(other) == jax.tree.structure(thing)
         assert hash(jax.tree.structure(other)) == hash(jax.tree.structure(thing))
 
+    @every_type
     def test_jit_takes_and_returns_it(self, thing):
         assert_close(jax.jit(lambda tree: jax.tree.map(lambda leaf: leaf * 1.0, tree))(thing), thing, rtol=0)
 
+    @every_type
     def test_eval_shape_gives_a_thing_of_shapes(self, thing):
         shapes = jax.eval_shape(lambda tree: tree, jax.tree.map(jnp.asarray, thing))
         assert type(shapes) is type(thing)
         for shape, leaf in zip(jax.tree.leaves(shapes), jax.tree.leaves(thing), strict=True):
             assert shape.shape == np.shape(leaf)
 
+    @every_type
     def test_adam_steps_every_leaf_against_its_gradient(self, thing):
         parameters = jax.tree.map(jnp.asarray, thing)
         optimiser = optax.adam(1e-3)
@@ -142,6 +153,7 @@ class TestEveryType:
         assert type(moments[0].mu) is type(thing)
         assert_close(stepped, jax.tree.map(lambda leaf: leaf - 1e-3, parameters), rtol=0, atol=1e-9)
 
+    @every_type
     def test_fields_cannot_be_set_or_deleted_or_added(self, thing):
         for name in (dataclasses.fields(thing)[0].name, "colour"):
             with pytest.raises(dataclasses.FrozenInstanceError):
@@ -149,28 +161,34 @@ class TestEveryType:
         with pytest.raises(dataclasses.FrozenInstanceError):
             delattr(thing, dataclasses.fields(thing)[0].name)
 
+    @every_type
     def test_what_jax_rebuilt_is_immutable_too(self, thing):
         with pytest.raises(dataclasses.FrozenInstanceError):
             setattr(jax.tree.map(lambda leaf: leaf, thing), dataclasses.fields(thing)[0].name, 1.0)
 
+    @every_type
     def test_a_pickle_holds_all_of_it(self, thing):
         assert_same(pickle.loads(pickle.dumps(thing)), thing)
         assert_same(pickle.loads(pickle.dumps(jax.tree.map(jnp.float32, thing))), jax.tree.map(jnp.float32, thing))
 
+    @every_type
     def test_copies_are_equal_in_every_leaf(self, thing):
         assert_same(copy.copy(thing), thing)
         assert_same(copy.deepcopy(thing), thing)
 
+    @every_type
     def test_equality_and_hash_are_those_of_an_object(self, thing):
         assert thing == thing
         assert thing != copy.copy(thing)
         assert {thing: 1}[thing] == 1
 
+    @every_type
     def test_its_text_names_the_type_and_every_field(self, thing):
         text = repr(thing)
         assert text.startswith(type(thing).__name__ + "(")
         assert all(f"{field.name}=" in text for field in dataclasses.fields(thing))
 
+    @every_type
     def test_constructing_it_anew_from_its_own_fields_changes_nothing(self, thing):
         assert_same(dataclasses.replace(thing), thing)
 

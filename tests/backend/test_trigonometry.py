@@ -4,13 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tables import rows
 
 from cpjax.backend.trigonometry import LARGEST_TURN, sin_cos, turned
 from cpjax.numeric.angles import wrap_angle
 
 LARGEST = 1e4  # the angle up to which the accuracy is promised
 WIDER = {np.float32: np.float64, np.float64: np.longdouble}
-DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64])
+DTYPES = rows("dtype", [np.float32, np.float64])
 
 
 def angles(dtype):
@@ -25,7 +26,7 @@ def angles(dtype):
 
 
 @DTYPES
-@pytest.mark.parametrize("compiled", [False, True])
+@rows("compiled", [False, True])
 def test_sine_and_cosine_are_within_two_ulp_of_one_up_to_ten_thousand(dtype, compiled):
     angle = angles(dtype)
     assert np.max(np.abs(angle)) <= LARGEST
@@ -61,7 +62,7 @@ def test_at_zero_sine_and_cosine_are_exact(dtype):
 
 
 @DTYPES
-@pytest.mark.parametrize("angle", [math.nan, math.inf, -math.inf])
+@rows("angle", [math.nan, math.inf, -math.inf])
 def test_what_is_no_angle_has_no_sine_or_cosine(dtype, angle):
     for function in (sin_cos, jax.jit(sin_cos)):
         assert all(np.isnan(value) for value in function(jnp.asarray(angle, dtype)))
@@ -80,8 +81,8 @@ def test_forward_and_reverse_derivatives_are_cosine_and_minus_sine_to_the_last_b
 
 
 @DTYPES
-@pytest.mark.parametrize("outer", [jax.jacfwd, jax.jacrev])
-@pytest.mark.parametrize("inner", [jax.jacfwd, jax.jacrev])
+@rows("outer", [jax.jacfwd, jax.jacrev])
+@rows("inner", [jax.jacfwd, jax.jacrev])
 def test_the_second_derivatives_are_minus_the_functions_to_the_last_bit(dtype, outer, inner):
     angle = jnp.asarray(angles(dtype)[::500])
     sin, cos = sin_cos(angle)
@@ -98,7 +99,7 @@ def test_a_tangent_passes_through_linearly_and_batches():
 
 
 @DTYPES
-@pytest.mark.parametrize("compiled", [False, True])
+@rows("compiled", [False, True])
 def test_a_turned_sine_and_cosine_are_within_two_ulp_of_one(dtype, compiled):
     rng = np.random.default_rng(5)
     angle = rng.uniform(-math.pi, math.pi, 200_000).astype(dtype)
@@ -153,7 +154,7 @@ def test_an_angle_of_less_than_half_a_turn_is_wrapped_to_itself(dtype):
     np.testing.assert_array_equal(wrap_angle(jnp.asarray(angle)), angle)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("angle", "wrapped"),
     [
         (0.0, 0.0),

@@ -15,6 +15,7 @@ import pytest
 from oracles import NAMES, columns, derivative, dop853, rough_plant
 from scipy.linalg import solve_continuous_are
 from scipy.signal import place_poles
+from tables import rows
 
 import cpjax
 from cpjax import (
@@ -57,7 +58,7 @@ def simulate(system, times, start, voltage=None, **options):
 # The plant
 
 
-@pytest.mark.parametrize("plant", [paper.appendix_plant(), ROUGH], ids=["appendix", "rough"])
+@rows("plant", [paper.appendix_plant(), ROUGH], ids=["appendix", "rough"])
 def test_the_plant_under_a_voltage_signal_is_scipys(plant):
     # python-control draws straight lines between the inputs' times: here a zigzag that goes beyond the clip.
     corners, zigzag = np.array([0.0, 0.5, 1.5, 2.5]), [0.0, 20.0, -20.0, 20.0]
@@ -150,7 +151,7 @@ def test_an_unlimited_supply_clips_nothing():
 # The linear model
 
 
-@pytest.mark.parametrize("equilibrium", ["upright", "hanging", State(1.5, 0.0, 0.0, 0.0)])
+@rows("equilibrium", ["upright", "hanging", State(1.5, 0.0, 0.0, 0.0)])
 def test_the_state_space_is_cpjaxs_linear_model_with_names(equilibrium):
     system = bridge.state_space(ROUGH, equilibrium)
     model = cpjax.linearize(ROUGH, equilibrium)
@@ -171,7 +172,7 @@ def test_the_outputs_are_the_named_states_in_the_order_asked_for():
     np.testing.assert_array_equal(bridge.state_space(ROUGH, outputs="theta").C, [[0, 0, 1, 0]])
 
 
-@pytest.mark.parametrize(("equilibrium", "theta"), [("upright", 0.0), ("hanging", math.pi)])
+@rows(("equilibrium", "theta"), [("upright", 0.0), ("hanging", math.pi)])
 def test_python_controls_own_linearisation_of_the_plant_is_cpjaxs(equilibrium, theta):
     plant = ROUGH
     numeric = bridge.plant_system(plant).linearize([0.0, 0.0, theta, 0.0], [0.0])
@@ -201,7 +202,7 @@ def catch_time(system, start, until):
     return high
 
 
-@pytest.mark.parametrize("plant", [paper.appendix_plant(), ROUGH], ids=["appendix", "rough"])
+@rows("plant", [paper.appendix_plant(), ROUGH], ids=["appendix", "rough"])
 def test_without_a_clip_the_continuous_loop_is_the_rollout_before_and_after_a_catch(plant):
     # A rollout switches at the end of a step, the system at the boundary: so let a step end just past the boundary.
     plant = replace(plant, motor=replace(plant.motor, voltage_limit=math.inf))
@@ -223,10 +224,8 @@ def test_without_a_clip_the_continuous_loop_is_the_rollout_before_and_after_a_ca
     np.testing.assert_array_equal(outputs["mode"], run.mode)
 
 
-@pytest.mark.parametrize("plant", [paper.appendix_plant(), ROUGH], ids=["appendix", "rough"])
-@pytest.mark.parametrize(
-    ("start", "mode"), [(LEANING, 0), (State(0.2, -0.3, 0.45, -0.2), 1)], ids=["swinging up", "catching"]
-)
+@rows("plant", [paper.appendix_plant(), ROUGH], ids=["appendix", "rough"])
+@rows(("start", "mode"), [(LEANING, 0), (State(0.2, -0.3, 0.45, -0.2), 1)], ids=["swinging up", "catching"])
 def test_with_the_clip_the_continuous_loop_is_the_rollout_in_either_mode(plant, start, mode):
     controller = hybrid(plant)
     run = cpjax.rollout(plant, controller, start, clock="continuous", duration=0.8, dt=1e-4, save_every=200)
@@ -256,7 +255,7 @@ def test_a_law_on_its_own_closes_the_loop_in_mode_0():
 # The closed loop in discrete time
 
 
-@pytest.mark.parametrize(
+@rows(
     ("controller", "start", "switches"),
     [
         pytest.param(hybrid(ROUGH), HANGING, 1, id="caught"),
@@ -297,7 +296,7 @@ def test_between_the_two_boundaries_the_mode_until_now_decides():
     assert system.output(0.0, [*beyond, 1.0], [])[5] == 0.0
 
 
-@pytest.mark.parametrize("period", [None, 1e-3])
+@rows("period", [None, 1e-3])
 def test_whole_numbers_are_states_too(period):
     system, start = (
         bridge.closed_loop_system(ROUGH, hybrid(ROUGH), period),
@@ -308,7 +307,7 @@ def test_whole_numbers_are_states_too(period):
     np.testing.assert_array_equal(system.output(0.0, start, []), system.output(0.0, decimals, []))
 
 
-@pytest.mark.parametrize("period", [None, 2e-3])
+@rows("period", [None, 2e-3])
 def test_in_jaxs_default_dtype_the_loop_is_the_same_to_float32(period):
     times = np.linspace(0.0, 0.2, 101)
     start = [*columns(LEANING), 0.0][: 4 if period is None else 5]
@@ -342,7 +341,7 @@ def test_a_placed_gain_has_the_papers_poles_in_either_package():
     np.testing.assert_allclose(np.sort(closed.poles().real), np.sort(paper.POLES), rtol=1e-6)
 
 
-@pytest.mark.parametrize("shape", [(1, 4), (4,)])
+@rows("shape", [(1, 4), (4,)])
 def test_a_gain_comes_back_as_it_went(shape):
     K = np.array([[-1.0, 2.0, -3.0, 4.0]])
     law = bridge.state_feedback(K.reshape(shape))
@@ -385,7 +384,7 @@ def traced(function, value):
     jax.eval_shape(function, value)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("call", "field"),
     [
         (lambda: bridge.plant_system(paper), "plant"),
@@ -443,7 +442,7 @@ def test_a_controller_that_remembers_is_told_to_give_a_control_period():
     bridge.closed_loop_system(ROUGH, replace(hybrid(ROUGH), gate=GateOfAStranger()), 1e-3)
 
 
-@pytest.mark.parametrize("gate", [AngleGate(0.4), AngleRateGate(0.4, 2.0), LyapunovGate(np.eye(4), 0.3)])
+@rows("gate", [AngleGate(0.4), AngleRateGate(0.4, 2.0), LyapunovGate(np.eye(4), 0.3)])
 def test_every_gate_without_hysteresis_closes_the_continuous_loop(gate):
     system = bridge.closed_loop_system(ROUGH, replace(hybrid(ROUGH), gate=gate))
     assert [system.output(0.0, [0.0, 0.0, theta, 0.0], [])[5] for theta in (0.0, math.pi)] == [1.0, 0.0]

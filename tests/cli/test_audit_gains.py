@@ -4,14 +4,15 @@ import json
 
 import numpy as np
 import pytest
+from tables import rows
 
 import cpjax.show.figures
 from cpjax import AngleGate, LyapunovGate, io, linearize, lqr, paper, place
 from cpjax.cli.options import build_controller, parse_poles
+from cpjax.paper import gain_identification
 from cpjax.paper.gain_identification import Direction, GainAudit, audit_gains, document
 from cpjax.paper.plant_fit import PARAMETERS, Fit
 from cpjax.paper.printed_gains import PrintedGain, printed_in_the_paper
-from cpjax.study import forensics
 
 APPENDIX = paper.appendix_plant()
 PAIR = ("--parameters", "torque_constant,back_emf_constant", "--starts", "8")
@@ -178,14 +179,14 @@ def assert_refused(result, folder, *words):
     assert not (folder / "out").exists()
 
 
-@pytest.mark.parametrize(("flags", "words"), BAD_FLAGS, ids=lambda v: " ".join(v)[:40])
+@rows(("flags", "words"), BAD_FLAGS, ids=lambda v: " ".join(v)[:40])
 def test_a_bad_audit_is_one_line_on_standard_error(command, tmp_path, flags, words):
     assert_refused(command("audit-gains", "--out", tmp_path / "out", *flags), tmp_path, *words)
 
 
 def test_weights_for_which_the_plant_has_no_gain_are_one_line_on_standard_error(command, tmp_path, monkeypatch):
     nothing = np.array([0.0] * 4 + [np.nan] * 4), None  # compiling what finds this out takes long
-    monkeypatch.setattr(forensics, "linearised", lambda prints, plant: nothing)
+    monkeypatch.setattr(gain_identification, "linearised", lambda prints, plant: nothing)
     blind = ("--q", "0", "1", "1000", "1", "--r", "1e-4")
     result = command("audit-gains", "--out", tmp_path / "out", *PAIR, *LQR, *blind, *PLACEMENT, *POLES)
     assert_refused(result, tmp_path, "lqr gain = (-1414.21, ", "a design for which the plant, before any change, has a")
@@ -205,7 +206,7 @@ BAD_FILES = [
 ]
 
 
-@pytest.mark.parametrize(("text", "words"), BAD_FILES, ids=lambda v: v[:30] if isinstance(v, str) else "")
+@rows(("text", "words"), BAD_FILES, ids=lambda v: v[:30] if isinstance(v, str) else "")
 def test_a_bad_file_of_an_audits_options_is_one_line_on_standard_error(command, tmp_path, text, words):
     (tmp_path / "audit.toml").write_text(text, encoding="utf-8")
     result = command("audit-gains", "--out", tmp_path / "out", "--config", tmp_path / "audit.toml")
@@ -254,7 +255,7 @@ def test_a_lyapunov_gate_of_given_weights_has_their_riccati_solution():
     assert isinstance(plain.gate, AngleGate)
 
 
-@pytest.mark.parametrize("gain", [{"poles": ["-3", "-4", "-5", "-6"]}, {"K": [1.0, 2.0, 3.0, 4.0]}], ids=["poles", "K"])
+@rows("gain", [{"poles": ["-3", "-4", "-5", "-6"]}, {"K": [1.0, 2.0, 3.0, 4.0]}], ids=["poles", "K"])
 def test_weights_beside_another_gain_are_those_of_the_lyapunov_gate(gain):
     Q = [20.0, 1.0, 50.0, 2.5]
     controller = build_controller({**gain, "Q": Q, "R": 0.01, "gate": "lyapunov", "level": 3.0}, PLANT)
@@ -280,7 +281,7 @@ def test_poles_from_the_shell_end_in_the_controller_that_runs(command, tmp_path,
     assert found == np.asarray(place(*MODEL, [-3.0, -4.0, -5 + 2j, -5 - 2j])).tolist()
 
 
-@pytest.mark.parametrize(
+@rows(
     ("text", "value"),
     [("-3", -3), ("-5+2j", -5 + 2j), ("-5-2i", -5 - 2j), (" -5 + 2j ", -5 + 2j), ("2e-1j", 0.2j), ("-1e1", -10)],
 )
@@ -313,7 +314,7 @@ CONFLICTS = [
 ]
 
 
-@pytest.mark.parametrize(("flags", "words"), CONFLICTS, ids=lambda v: " ".join(v)[:40])
+@rows(("flags", "words"), CONFLICTS, ids=lambda v: " ".join(v)[:40])
 def test_a_gain_that_cannot_be_or_is_given_twice_is_one_line_on_standard_error(command, tmp_path, flags, words):
     result = command("swingup", "--out", tmp_path / "out", "--duration", "0.1", "--dt", "0.01", *flags)
     assert_refused(result, tmp_path, *words)

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from tables import rows
 
 import cpjax.show.figures
 import cpjax.show.reproduction
@@ -37,8 +38,8 @@ from cpjax.cli.basin import CONTROLLERS, file_of
 from cpjax.cli.options import controller_title
 from cpjax.cli.reproduce import print_rows
 from cpjax.cli.swingup import OPTIONS
+from cpjax.paper import reproduction
 from cpjax.paper.reproduction import Setting, evaluate, reproduce, trajectory, variants
-from cpjax.study import reproduction
 from cpjax.study.summary import summarise
 
 SETTING = Setting(count=8, duration=12.0, dt=0.01)
@@ -119,7 +120,7 @@ def test_a_run_that_blows_up_exits_with_1_and_names_its_flag(command, tmp_path, 
     assert strict_json(tmp_path / "swingup.json")["flag"] == "runaway"
 
 
-@pytest.mark.parametrize("number", ["-5e-3", "-1E2", "-.5", "-1.e0"])
+@rows("number", ["-5e-3", "-1E2", "-.5", "-1.e0"])
 def test_negative_numbers_may_be_written_with_an_exponent(command, tmp_path, no_pictures, number):
     result = command("swingup", "--out", tmp_path, *SHORT, "--kick", number, "--gain", number, "1", number, "2")
     assert result.code == 1
@@ -270,7 +271,7 @@ def test_an_option_does_the_same_from_the_shell_and_from_a_file_and_does_somethi
     assert "controller" not in different or expected & {"plant", "controller"}  # the law's model is the plant
 
 
-@pytest.mark.parametrize("extension", ["json", "toml"])
+@rows("extension", ["json", "toml"])
 def test_a_plant_in_a_file_is_the_base_that_other_options_change(command, tmp_path, no_pictures, extension):
     path = tmp_path / f"plant.{extension}"
     io.save(path, CartPole(cart_mass=3.0, motor=Motor(resistance=2.0)))
@@ -540,7 +541,7 @@ def test_odd_names_of_folders_are_taken_as_they_are(command, workplace, no_pictu
 # --- help, version, exit codes ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["swingup", "design", "reproduce", "audit-gains", "report"])
+@rows("name", ["swingup", "design", "reproduce", "audit-gains", "report"])
 def test_the_help_of_a_command_exits_with_0_and_names_what_every_command_has(command, name):
     result = command(name, "--help")
     assert (result.code, result.err) == (0, "")
@@ -562,7 +563,7 @@ def test_the_main_help_names_the_commands_and_the_exit_codes(command):
         assert word in result.out
 
 
-@pytest.mark.parametrize("arguments", [[], ["upswing"], ["--verbose"]], ids=str)
+@rows("arguments", [[], ["upswing"], ["--verbose"]], ids=str)
 def test_no_or_an_unknown_command_is_one_line_on_standard_error(command, tmp_path, arguments):
     assert_refused(command(*arguments), tmp_path)
 

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tables import rows
 
 import cpjax
 import cpjax.show.figures
@@ -219,7 +220,7 @@ def gain(folder):
     return np.asarray(io.read_table(folder / "design.json")["K"])
 
 
-@pytest.mark.parametrize("design", ["placement", "lqr"])
+@rows("design", ["placement", "lqr"])
 def test_a_plant_that_is_not_the_papers_gets_a_gain_computed_for_it(command, tmp_path, design):
     plant = CartPole(cart_mass=2.0, motor=Motor(voltage_limit=6.0))
     io.save(tmp_path / "mine.toml", plant)
@@ -228,7 +229,7 @@ def test_a_plant_that_is_not_the_papers_gets_a_gain_computed_for_it(command, tmp
         np.testing.assert_array_equal(gain(tmp_path), paper.computed_gain(design, plant))
 
 
-@pytest.mark.parametrize("given", [(), ("--plant", "identified"), ("--voltage-limit", "9"), ("--cart-mass", "1")])
+@rows("given", [(), ("--plant", "identified"), ("--voltage-limit", "9"), ("--cart-mass", "1")])
 def test_the_papers_plants_keep_its_printed_gain_whatever_their_supply(command, tmp_path, given):
     assert command("design", *given, "--out", tmp_path).err == ""
     np.testing.assert_array_equal(gain(tmp_path), [paper.PRINTED_GAINS["placement"]])
@@ -354,7 +355,7 @@ def test_a_full_state_weight_is_taken_from_a_file_and_from_flags(command, tmp_pa
         assert io.read_table(tmp_path / "design.json")["controller"]["regulator"]["design"]["Q"] == FULL
 
 
-@pytest.mark.parametrize(
+@rows(
     ("value", "words"),
     [
         ("[1, 2, 3]", "a list of 4 or 16 values"),
@@ -372,7 +373,7 @@ def test_a_state_weight_of_another_shape_is_refused_by_name(command, tmp_path, v
     assert words in result.err
 
 
-@pytest.mark.parametrize("flags", [["1", "2", "3"], ["1"] * 15])
+@rows("flags", [["1", "2", "3"], ["1"] * 15])
 def test_a_flag_of_another_number_of_weights_is_refused_by_name(command, tmp_path, flags):
     result = command("design", "--q", *flags, "--out", tmp_path / "out")
     assert (result.code, result.err.count("\n")) == (2, 1)
@@ -387,7 +388,7 @@ def test_poles_may_be_numbers_texts_or_pairs_in_a_file(command, tmp_path):
     np.testing.assert_array_equal(gain(tmp_path), expected)
 
 
-@pytest.mark.parametrize("pole", ["[-3]", "[-3, 0, 1]", "[-3, true]", "['-3', 0]", "true"])
+@rows("pole", ["[-3]", "[-3, 0, 1]", "[-3, true]", "['-3', 0]", "true"])
 def test_a_pole_of_another_shape_is_refused_with_what_is_allowed(command, tmp_path, pole):
     (tmp_path / "run.toml").write_text(f"[controller]\npoles = [{pole}, -4, -5, -6]\n")
     result = command("design", "--config", tmp_path / "run.toml", "--out", tmp_path / "out")
@@ -406,8 +407,8 @@ def test_the_results_of_commands_are_plants_and_controllers_for_others(command, 
     assert first == last
 
 
-@pytest.mark.parametrize("option", ["--plant", "--controller"])
-@pytest.mark.parametrize(
+@rows("option", ["--plant", "--controller"])
+@rows(
     ("content", "holds"),
     [
         ({"type": "Motor"}, "a Motor"),
@@ -426,7 +427,7 @@ def test_a_file_of_another_kind_is_refused_with_what_it_holds(command, tmp_path,
     assert "LyapunovGate" not in result.err
 
 
-@pytest.mark.parametrize(("gate", "key"), [("angle-rate", "rate"), ("lyapunov", "level")])
+@rows(("gate", "key"), [("angle-rate", "rate"), ("lyapunov", "level")])
 def test_what_has_to_be_given_is_named_without_a_value(command, tmp_path, gate, key):
     result = command("design", "--gate", gate, "--out", tmp_path / "out")
     assert result.err == f"cpjax design: error: {key}: must be given, because the gate {gate} needs it\n"
@@ -435,7 +436,7 @@ def test_what_has_to_be_given_is_named_without_a_value(command, tmp_path, gate, 
 # --- extreme numbers, failures, progress ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@rows(
     ("flags", "code"),
     [
         (["--voltage-limit", "5e-324"], 0),
@@ -467,10 +468,8 @@ def test_a_design_that_is_not_stable_says_so_first_and_prints_no_nan(command, tm
     assert notes_of(result) == expected
 
 
-@pytest.mark.parametrize("gains", [[-24.74, -25.36, 111.7, 28.58], [0.0, -25.36, 111.7, 28.58], [1.0, 2.0, 3.0, 4.0]])
-@pytest.mark.parametrize(
-    "plant", [CartPole(), CartPole.rod(mass=0.2, length=0.6, cart_friction=0.1, pivot_friction=0.01)]
-)
+@rows("gains", [[-24.74, -25.36, 111.7, 28.58], [0.0, -25.36, 111.7, 28.58], [1.0, 2.0, 3.0, 4.0]])
+@rows("plant", [CartPole(), CartPole.rod(mass=0.2, length=0.6, cart_friction=0.1, pivot_friction=0.01)])
 def test_the_unstable_pole_is_that_of_the_linear_model(gains, plant):
     A, B = (np.asarray(matrix) for matrix in linearize(plant))
     poles = np.linalg.eigvals(A - B @ np.array([gains]))
@@ -492,7 +491,7 @@ WHY = [
 ]
 
 
-@pytest.mark.parametrize(("flags", "reason"), WHY, ids=[reason for _, reason in WHY])
+@rows(("flags", "reason"), WHY, ids=[reason for _, reason in WHY])
 def test_a_swing_up_that_does_not_settle_says_why_in_one_line(command, tmp_path, flags, reason):
     result = command("swingup", *flags, "--out", tmp_path)
     assert result.code == 1

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tables import rows
 
 import cpjax
 from cpjax import io, paper
@@ -76,7 +77,7 @@ def test_a_tuning_that_settles_from_no_start_says_so_in_its_exit_code(tmp_path, 
     assert io.read_table(tmp_path / "tune.json")["success_rate"] == 0.0
 
 
-@pytest.mark.parametrize(("option", "value"), [("--design", "lqr"), ("--gate", "lyapunov")])
+@rows(("option", "value"), [("--design", "lqr"), ("--gate", "lyapunov")])
 def test_a_file_to_start_from_has_its_design_and_gate_already(option, value, tmp_path, command):
     io.save(tmp_path / "law.json", preset("placement"))
     done = command("tune", "--start-from", tmp_path / "law.json", option, value, "--out", tmp_path)
@@ -84,7 +85,7 @@ def test_a_file_to_start_from_has_its_design_and_gate_already(option, value, tmp
     assert option.removeprefix("--") in done.err
 
 
-@pytest.mark.parametrize(
+@rows(
     ("arguments", "words"),
     [
         (("--steps", "-1"), "steps = -1"),
@@ -111,7 +112,7 @@ def test_a_preset_that_does_not_exist_is_refused():
         preset("h-infinity")
 
 
-@pytest.mark.parametrize("design", DESIGNS)
+@rows("design", DESIGNS)
 def test_a_shipped_controller_is_what_its_design_gives_and_swings_up_every_start(design):
     law = preset(design)
     assert isinstance(law.regulator.design, LqrWeights if design == "lqr" else PoleFactors)

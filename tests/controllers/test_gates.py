@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tables import rows
 
 import cpjax
 from cpjax import REGULATE, SWING_UP, AngleGate, AngleRateGate, LyapunovGate, State
@@ -21,7 +22,7 @@ def is_open(gate, state, mode=SWING_UP):
     return bool(gate.margin(state, jnp.asarray(mode)) >= 0)
 
 
-@pytest.mark.parametrize("turns", [-2, -1, 0, 1, 3])
+@rows("turns", [-2, -1, 0, 1, 3])
 def test_the_angle_gate_opens_within_its_half_angle_on_every_turn(turns):
     gate = AngleGate(half_angle=0.5)
     for theta in (-0.499, 0.0, 0.499):
@@ -56,7 +57,7 @@ def test_the_lyapunov_gate_is_the_level_set_of_its_form_with_the_angle_wrapped()
         assert is_open(gate, at(s[2] - math.tau, s[3], s[0], s[1])) == (value <= 1.5)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("gate", "edge"),
     [
         (AngleGate(half_angle=0.4, hysteresis=0.25), lambda size: at(0.4 * size)),
@@ -103,8 +104,8 @@ def test_each_mode_has_the_voltage_of_its_own_law():
     assert float(regulating) != pytest.approx(float(swinging))
 
 
-@pytest.mark.parametrize("gate", [AngleGate(0.4), AngleRateGate(0.4, 2.0), LyapunovGate(P, 0.3)])
-@pytest.mark.parametrize("theta", [0.0, 0.4, -0.4, math.pi, -math.pi, 3 * math.pi, 1.0])
+@rows("gate", [AngleGate(0.4), AngleRateGate(0.4, 2.0), LyapunovGate(P, 0.3)])
+@rows("theta", [0.0, 0.4, -0.4, math.pi, -math.pi, 3 * math.pi, 1.0])
 def test_the_margins_derivative_agrees_forward_in_reverse_and_with_differences(gate, theta):
     def margin(v):
         return gate.margin(State.from_vector(v), jnp.asarray(SWING_UP))

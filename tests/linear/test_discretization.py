@@ -13,6 +13,7 @@ from oracles import dop853, rough_plant
 from scipy.integrate import quad_vec
 from scipy.linalg import expm, solve_discrete_are
 from scipy.signal import cont2discrete
+from tables import rows
 
 from cpjax import InputError, State, linearize, paper
 from cpjax.linear.discretization import discretize, discretize_cost
@@ -56,9 +57,9 @@ def error(ours, reference):
     return float(np.max(np.abs(np.asarray(ours, dtype=float) - reference)) / (scale if scale > 0 else 1.0))
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("period", PERIODS)
-@pytest.mark.parametrize("model", MODELS)
+@rows("dtype", [np.float64, np.float32])
+@rows("period", PERIODS)
+@rows("model", MODELS)
 def test_model_and_cost_are_exact_to_a_few_roundings_of_the_largest_entry(model, period, dtype):
     A, B, Q, R = (M.astype(dtype) for M in MODELS[model])
     period = dtype(period)
@@ -70,8 +71,8 @@ def test_model_and_cost_are_exact_to_a_few_roundings_of_the_largest_entry(model,
     assert max(map(error, ours, reference)) <= allowed
 
 
-@pytest.mark.parametrize("model", ["upright", "hanging", "two inputs"])
-@pytest.mark.parametrize("period", [1e-3, 0.02, 0.5])
+@rows("model", ["upright", "hanging", "two inputs"])
+@rows("period", [1e-3, 0.02, 0.5])
 def test_the_model_is_scipys_and_python_controls(model, period):
     A, B, _, _ = MODELS[model]
     ours = discretize(A, B, period)
@@ -92,7 +93,7 @@ def test_the_sampled_model_is_the_derivative_of_a_held_step_of_the_plant():
     assert max(map(error, discretize(*UPRIGHT, 0.02), (A, B[:, None]))) <= 1e-12
 
 
-@pytest.mark.parametrize("turns", [0.5, 1.0, 1.7, 3.0, 50.0])
+@rows("turns", [0.5, 1.0, 1.7, 3.0, 50.0])
 def test_a_rotation_stays_one_at_every_angle(turns):
     # JAX's exponential of this matrix is wrong by 2e-8 at 1.7 turns.
     angle = 2.0 * math.pi * turns
@@ -102,8 +103,8 @@ def test_a_rotation_stays_one_at_every_angle(turns):
     assert np.max(np.abs(B[:, 0] - np.array([1.0 - cos, sin]))) <= 8 * np.finfo(float).eps * angle
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("period", [1e2, 1e4, 1e6, 1e9])
+@rows("dtype", [np.float64, np.float32])
+@rows("period", [1e2, 1e4, 1e6, 1e9])
 def test_a_stable_model_forgets_its_start_over_a_long_period(period, dtype):
     # s' = -s + u twice: what is left is the input's share, and a cost that still remembers how it began.
     eye, ones = np.eye(2, dtype=dtype), np.ones((2, 1), dtype=dtype)
@@ -129,8 +130,8 @@ def test_two_periods_are_the_period_twice():
 # The cost
 
 
-@pytest.mark.parametrize("model", ["upright", "hanging", "two inputs"])
-@pytest.mark.parametrize("period", [1e-3, 0.1, 1.0])
+@rows("model", ["upright", "hanging", "two inputs"])
+@rows("period", [1e-3, 0.1, 1.0])
 def test_the_cost_is_the_integral_by_quadrature(model, period):
     A, B, Q, R = MODELS[model]
     n, m = B.shape
@@ -255,7 +256,7 @@ def test_derivatives_agree_forward_in_reverse_with_differences_and_under_vmap(po
             np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12 * np.max(np.abs(one)))
 
 
-@pytest.mark.parametrize("what", ["A", "B", "period"])
+@rows("what", ["A", "B", "period"])
 def test_the_models_own_derivatives_are_those_of_their_definition(what):
     # d exp(A T) / dT = A exp(A T); Bd is linear in B; and along a direction that commutes with A, exp' is exp.
     A, B = UPRIGHT
@@ -294,7 +295,7 @@ def test_a_vector_is_taken_as_the_input_matrix_and_a_number_as_the_weight_of_one
 A2, B2 = np.eye(2, k=1), np.ones((2, 1))
 
 
-@pytest.mark.parametrize(
+@rows(
     ("call", "field"),
     [
         (lambda: discretize(np.ones((2, 3)), B2, 0.1), "A"),
@@ -327,7 +328,7 @@ def test_bad_input_is_refused_by_name(call, field):
     assert caught.value.field == field
 
 
-@pytest.mark.parametrize("period", [0.0, -1.0, math.nan, math.inf, 1e12])
+@rows("period", [0.0, -1.0, math.nan, math.inf, 1e12])
 def test_inside_jit_a_bad_period_gives_nan(period):
     model = jax.jit(discretize)(A2, B2, period)
     cost = jax.jit(discretize_cost)(A2, B2, np.eye(2), np.eye(1), period)

@@ -10,6 +10,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from oracles import jacobian
 from scipy.linalg import eigh, expm, solve_continuous_lyapunov
+from tables import rows
 
 from cpjax import AngleGate, AngleRateGate, InputError, LyapunovGate, State, StateFeedback, linearize, paper, sweep
 from cpjax.linear.limits import (
@@ -27,7 +28,7 @@ PLANT = paper.identified_plant()
 A, B = linearize(PLANT)
 K = paper.computed_gain("placement", PLANT)
 GATES = [(0.5, 2.0), (0.5, 200.0), (0.02, 1.0), (2.5, 3.0), (3.0, 0.1), (3.14, 2000.0), (math.pi, 20.0)]
-the_gates = pytest.mark.parametrize(("half_angle", "rate"), GATES)
+the_gates = rows(("half_angle", "rate"), GATES)
 
 
 def random_form(rng, n=4):
@@ -58,7 +59,7 @@ def used(half_angle, rate, angle, angle_rate):
 # --- no point beyond, and one that gets there -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(5))
+@rows("seed", range(5))
 def test_no_state_of_the_level_set_asks_for_more_than_the_voltage_limit_and_one_asks_for_all_of_it(seed):
     rng = np.random.default_rng(seed)
     P, gain, limit = random_form(rng), rng.normal(size=(1, 4)) * 30.0, rng.uniform(5.0, 30.0)
@@ -70,7 +71,7 @@ def test_no_state_of_the_level_set_asks_for_more_than_the_voltage_limit_and_one_
     assert abs(extreme @ gain[0]) == pytest.approx(limit, rel=1e-10)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@rows("seed", range(5))
 def test_no_state_of_the_level_set_leaves_the_angle_gate_and_one_stands_on_its_edge(seed):
     rng = np.random.default_rng(seed)
     P, half_angle = random_form(rng), rng.uniform(0.1, 3.0)
@@ -81,7 +82,7 @@ def test_no_state_of_the_level_set_leaves_the_angle_gate_and_one_stands_on_its_e
 
 
 @the_gates
-@pytest.mark.parametrize("seed", range(3))
+@rows("seed", range(3))
 def test_no_state_of_the_level_set_leaves_the_angle_and_rate_gate_and_one_stands_on_its_edge(half_angle, rate, seed):
     rng = np.random.default_rng(seed)
     P = random_form(rng)
@@ -94,7 +95,7 @@ def test_no_state_of_the_level_set_leaves_the_angle_and_rate_gate_and_one_stands
     assert np.max(used(half_angle, rate, far[:, 2], far[:, 3])) <= 1.0 + 1e-9
 
 
-@pytest.mark.parametrize("seed", range(5))
+@rows("seed", range(5))
 def test_no_state_of_the_level_set_leaves_another_level_set_and_one_touches_it(seed):
     rng = np.random.default_rng(seed)
     P, other, bound = random_form(rng), random_form(rng), rng.uniform(0.5, 40.0)
@@ -105,7 +106,7 @@ def test_no_state_of_the_level_set_leaves_another_level_set_and_one_touches_it(s
     assert level == pytest.approx(bound / eigh(other, P, eigvals_only=True)[-1], rel=1e-10)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("gate", "level_of"),
     [
         (AngleGate(0.5), lambda P: level_within_angle(P, 0.5)),
@@ -206,7 +207,7 @@ def test_at_the_papers_switch_its_lqr_gain_asks_for_2500_volts_and_pole_placemen
 # --- the Lyapunov function --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("design", ["placement", "lqr"])
+@rows("design", ["placement", "lqr"])
 def test_the_lyapunov_function_is_scipys_and_falls_along_the_linear_closed_loop_by_what_was_asked(design):
     gain = np.array([paper.PRINTED_GAINS[design]])
     Q = random_form(np.random.default_rng(6))
@@ -317,8 +318,8 @@ def test_second_derivatives_of_the_level_inside_angle_and_rate_are_those_of_the_
         np.testing.assert_allclose(hessian(limits), expected, rtol=1e-8, atol=1e-8 * np.max(np.abs(expected)))
 
 
-@pytest.mark.parametrize("half_angle", [1e-6, 0.5, 3.1, math.pi])
-@pytest.mark.parametrize("rate", [1e-6, 2.0, 1e4])
+@rows("half_angle", [1e-6, 0.5, 3.1, math.pi])
+@rows("rate", [1e-6, 2.0, 1e4])
 def test_no_derivative_of_the_level_inside_angle_and_rate_is_nan_however_extreme_the_gate(half_angle, rate):
     for P in (np.eye(4), FORM):
         assert all(np.all(np.isfinite(slope)) for slope in slopes(jnp.asarray(P), half_angle, rate))
@@ -396,7 +397,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("function", "given", "field", "allowed"), REFUSED)
+@rows(("function", "given", "field", "allowed"), REFUSED)
 def test_what_makes_no_sense_is_refused_by_name(function, given, field, allowed):
     with pytest.raises(InputError, match=rf"^{field} = .*: must be .*{re.escape(allowed)}"):
         function(*given)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from oracles import jacobian, lyapunov_operator, relative_error
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
+from tables import rows
 
 from cpjax import InputError
 from cpjax.linear.lyapunov import lyapunov, stein
@@ -17,7 +18,7 @@ SCIPY = {
     "continuous": lambda A, Q: solve_continuous_lyapunov(A.T, -Q),
     "discrete": lambda A, Q: solve_discrete_lyapunov(A.T, Q, method="bilinear"),
 }
-both = pytest.mark.parametrize("time", SOLVERS)
+both = rows("time", SOLVERS)
 
 
 def stable(time, n, rng, margin):
@@ -37,7 +38,7 @@ def exact_solution(time, A, Q):
 
 
 @both
-@pytest.mark.parametrize("n", [1, 2, 4])
+@rows("n", [1, 2, 4])
 def test_the_solution_is_the_rounding_of_the_exact_one_even_close_to_the_edge_of_stability(time, n):
     rng = np.random.default_rng(n)
     systems = [(stable(time, n, rng, margin), rng.normal(size=(n, n))) for margin in (0.5, 0.1, 1e-3, 1e-6)]
@@ -47,7 +48,7 @@ def test_the_solution_is_the_rounding_of_the_exact_one_even_close_to_the_edge_of
 
 
 @both
-@pytest.mark.parametrize("n", [8, 16])
+@rows("n", [8, 16])
 def test_large_systems_are_solved_as_scipy_solves_them(time, n):
     rng = np.random.default_rng(n)
     A, Q = stable(time, n, rng, 0.05), rng.normal(size=(n, n))
@@ -139,7 +140,7 @@ def test_an_unstable_system_gives_nan_inside_jit_and_spoils_no_other_lane(time):
 
 
 @both
-@pytest.mark.parametrize(
+@rows(
     ("field", "arguments"),
     [
         ("A", (np.ones((2, 3)), np.eye(2))),

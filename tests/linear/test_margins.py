@@ -11,6 +11,7 @@ import pytest
 from scipy.linalg import solve_continuous_are
 from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import place_poles
+from tables import rows
 
 import cpjax
 from cpjax import InputError, paper
@@ -18,7 +19,7 @@ from cpjax.linear.margins import Margins, characteristic_polynomial, closed_loop
 
 MARGINS = ("gain_lower", "gain_upper", "phase", "delay", "disk")
 PAPERS_LOOPS = [(plant, design) for plant in paper.PLANTS for design in paper.PRINTED_GAINS]
-the_papers_loops = pytest.mark.parametrize(("plant", "design"), PAPERS_LOOPS)
+the_papers_loops = rows(("plant", "design"), PAPERS_LOOPS)
 
 
 def papers_loop(plant, design):
@@ -123,7 +124,7 @@ def test_the_papers_loops_have_python_controls_margins(plant, design):
     assert math.isnan(found["gain_upper_frequency"])
 
 
-@pytest.mark.parametrize("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 6))])
+@rows("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 6))])
 def test_random_loops_have_python_controls_margins(n):
     for loop in random_loops(n, 40):
         found = numbers(margins(*loop))
@@ -143,7 +144,7 @@ def test_the_disk_margins_are_python_controls(plant, design):
     assert found["disk_phase"] == pytest.approx(math.radians(phase), rel=1e-10)
 
 
-@pytest.mark.parametrize("n", [2, 4, 6])
+@rows("n", [2, 4, 6])
 def test_no_margin_of_a_random_loop_is_missed_that_a_dense_grid_finds(n):
     for loop in random_loops(n, 25, seed=1):
         found = numbers(margins(*loop))
@@ -151,7 +152,7 @@ def test_no_margin_of_a_random_loop_is_missed_that_a_dense_grid_finds(n):
             assert found[name] == pytest.approx(value, rel=1e-9), (name, loop)
 
 
-@pytest.mark.parametrize("damping", [1e-2, 1e-4, 1e-6])
+@rows("damping", [1e-2, 1e-4, 1e-6])
 def test_a_resonance_is_found_however_narrow_it_is(damping):
     """Two oscillators, of which the faster one has |L| > 1 over a band of the width of its damping."""
     A = np.array([[0, 1, 0, 0], [-1, -0.5, 0, 0], [0, 0, 0, 1], [0, 0, -1e4, -200 * damping]])
@@ -187,7 +188,7 @@ LOOPS = {
         np.array([-1, 0, -2, 0.1]),
     ),
 }
-every_loop = pytest.mark.parametrize("loop", LOOPS.values(), ids=LOOPS.keys())
+every_loop = rows("loop", LOOPS.values(), ids=LOOPS.keys())
 
 
 def test_these_loops_have_between_them_every_kind_of_gain_margin():
@@ -339,7 +340,7 @@ def test_a_plant_with_poles_on_the_axis_has_finite_margins():
     ) == pytest.approx(crossovers[1], rel=1e-9)
 
 
-@pytest.mark.parametrize(("B", "K"), [([1.0, 1.0], [0.0, 0.0]), ([0.0, 0.0], [1.0, 1.0])])
+@rows(("B", "K"), [([1.0, 1.0], [0.0, 0.0]), ([0.0, 0.0], [1.0, 1.0])])
 def test_without_feedback_nothing_limits_a_stable_plant(B, K):
     found = margins([[-1.0, 0.0], [1.0, -2.0]], B, K)
     expect(found, gain_lower=0.0, gain_upper=math.inf, phase=math.inf, delay=math.inf, disk=2.0, disk_gain=math.inf)
@@ -444,7 +445,7 @@ def test_every_finite_margins_derivative_agrees_forward_in_reverse_and_with_diff
         assert np.all(np.abs(ahead - differences) <= 1e-8 * scale)
 
 
-@pytest.mark.parametrize(
+@rows(
     "loop",
     [
         ([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 2.0]),
@@ -525,7 +526,7 @@ def test_the_derivative_of_simple_poles_agrees_forward_in_reverse_and_with_diffe
     np.testing.assert_allclose(jax.vmap(jax.jacrev(poles))(jnp.stack([K, K]))[1], back, rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 5, 8])
+@rows("n", [1, 2, 3, 5, 8])
 def test_the_characteristic_polynomial_is_numpys(n):
     A = np.random.default_rng(n).normal(size=(n, n))
     np.testing.assert_allclose(characteristic_polynomial(A), np.poly(A)[1:], rtol=1e-10, atol=1e-12)
@@ -559,7 +560,7 @@ def test_the_loops_polynomials_are_python_controls_and_add_up_to_the_closed_loop
     assert np.all(np.abs(characteristic_polynomial(closed) - (N + D)) <= bound)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("field", "loop"),
     [
         ("A", (np.zeros((2, 3)), [0.0, 1.0], [1.0, 1.0])),
@@ -577,7 +578,7 @@ def test_what_is_no_loop_is_refused_by_name(field, loop):
         assert refusal.value.field == field
 
 
-@pytest.mark.parametrize(
+@rows(
     ("field", "loop"),
     [("B", (np.eye(2), np.ones((3, 1)), np.ones((1, 2)))), ("K", (np.eye(2), np.eye(2), [1.0, 1.0]))],
 )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from oracles import jacobian, relative_error
 from scipy.signal import place_poles
+from tables import rows
 
 from cpjax import InputError, linearize, paper
 from cpjax.linear.placement import QuadraticFactors, place, place_polynomial, polynomial_from_poles
@@ -70,7 +71,7 @@ def test_the_appendix_plant_has_the_gain_that_follows_from_the_printed_poles():
     assert relative_error(K, control.acker(A, B, POLES)) <= 1e-8
 
 
-@pytest.mark.parametrize("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5, 6, 7, 8))])
+@rows("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5, 6, 7, 8))])
 def test_the_closed_loop_has_the_wanted_polynomial_however_the_poles_lie(n):
     rng = np.random.default_rng(n)
     cases = [
@@ -84,7 +85,7 @@ def test_the_closed_loop_has_the_wanted_polynomial_however_the_poles_lie(n):
     assert max(errors) <= 1e-10
 
 
-@pytest.mark.parametrize("name", pole_sets(4, np.random.default_rng(0)))
+@rows("name", pole_sets(4, np.random.default_rng(0)))
 def test_poles_of_the_paper_plant_are_placed_wherever_they_lie(name):
     poles = pole_sets(4, np.random.default_rng(0))[name]
     K = place(A, B, poles)
@@ -93,7 +94,7 @@ def test_poles_of_the_paper_plant_are_placed_wherever_they_lie(name):
     assert relative_error(K, control.acker(A, B, poles)) <= 1e-9
 
 
-@pytest.mark.parametrize("n", [2, 3, 4])
+@rows("n", [2, 3, 4])
 def test_distinct_poles_are_placed_as_scipy_places_them(n):
     rng = np.random.default_rng(20 + n)
     for _ in range(5):
@@ -126,7 +127,7 @@ def test_order_dtype_and_container_of_the_poles_do_not_matter():
     np.testing.assert_array_equal(place_polynomial(A, B, polynomial_from_poles(POLES)), expected)
 
 
-@pytest.mark.parametrize("poles", [POLES, np.full(4, -4.0), np.array([-3 + 2j, -3 - 2j, -3 + 2j, -3 - 2j])])
+@rows("poles", [POLES, np.full(4, -4.0), np.array([-3 + 2j, -3 - 2j, -3 + 2j, -3 - 2j])])
 def test_float32_arguments_give_a_float32_gain_to_its_rounding(poles):
     narrow = [x.astype(np.float32) for x in (A, B)]
     K = place(*narrow, poles)
@@ -166,7 +167,7 @@ def rotated(count, seed):
     return turns * modes[:, None] @ np.swapaxes(turns, 1, 2), turns @ np.array([[0.0], [1.0], [1.0]])
 
 
-@pytest.mark.parametrize("name", UNCONTROLLABLE)
+@rows("name", UNCONTROLLABLE)
 def test_a_pair_that_is_not_controllable_is_refused(name):
     with pytest.raises(InputError, match="controllable") as caught:
         place(*UNCONTROLLABLE[name], [-1.0, -2.0, -3.0])
@@ -210,14 +211,14 @@ BAD_POLES = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_POLES)
+@rows("name", BAD_POLES)
 def test_what_is_no_set_of_four_poles_is_refused(name):
     with pytest.raises(InputError) as caught:
         place(A, B, BAD_POLES[name])
     assert caught.value.field == "poles"
 
 
-@pytest.mark.parametrize(
+@rows(
     ("field", "arguments"),
     [
         ("A", (A[:3], B, POLES)),
@@ -236,9 +237,7 @@ def test_matrices_that_do_not_fit_are_refused(field, arguments):
     assert caught.value.field == field
 
 
-@pytest.mark.parametrize(
-    "coefficients", [[1.0, 2.0, 3.0], [1.0, 2.0, 3.0, np.nan], [1.0, 2.0, 3.0, 1j], ["a"] * 4, 1.0]
-)
+@rows("coefficients", [[1.0, 2.0, 3.0], [1.0, 2.0, 3.0, np.nan], [1.0, 2.0, 3.0, 1j], ["a"] * 4, 1.0])
 def test_coefficients_that_do_not_fit_are_refused(coefficients):
     with pytest.raises(InputError) as caught:
         place_polynomial(A, B, coefficients)
@@ -315,7 +314,7 @@ def exact_gain(x, n):
     return K[0]
 
 
-@pytest.mark.parametrize("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5, 6))])
+@rows("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5, 6))])
 def test_derivatives_are_right_to_eight_digits_where_the_closed_loops_condition_is_below_a_million(n):
     rng = np.random.default_rng(n)
     x = np.stack([vector(rng.normal(size=(n, n)), rng.normal(size=(n, 1)), -np.arange(1.0, n + 1)) for _ in range(12)])
@@ -424,7 +423,7 @@ STABLE = {
 }
 
 
-@pytest.mark.parametrize("name", STABLE)
+@rows("name", STABLE)
 def test_poles_become_factors_and_factors_the_poles(name):
     poles = np.array(STABLE[name])
     factors = QuadraticFactors.from_poles(poles)
@@ -440,7 +439,7 @@ def test_poles_become_factors_and_factors_the_poles(name):
         np.testing.assert_allclose(part, other, rtol=1e-14)
 
 
-@pytest.mark.parametrize("n", [1, 4, 5])
+@rows("n", [1, 4, 5])
 def test_any_vector_makes_a_stable_polynomial(n):
     x = jnp.asarray(np.random.default_rng(n).normal(size=(50, n)))
     coefficients, poles = jax.jit(
@@ -459,7 +458,7 @@ def test_factors_keep_the_dtype_of_the_vector():
     assert factors.unconstrained().dtype == jnp.float32
 
 
-@pytest.mark.parametrize(
+@rows(
     "poles",
     [
         [-1.0, 2.0],

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from oracles import jacobian, lyapunov_operator, relative_error
 from scipy.linalg import expm
+from tables import rows
 
 from cpjax import InputError, linearize, paper
 from cpjax.linear.riccati import care, dare, solve_care, solve_dare
@@ -21,9 +22,7 @@ BATCHED = {time: jax.jit(jax.vmap(solve)) for time, solve in SOLVERS.items()}
 LANES = 40
 both = pytest.mark.parametrize("time", SOLVERS)
 # What is done to the arguments is the same code for both.
-continuous_discrete_slow = pytest.mark.parametrize(
-    "time", ["continuous", pytest.param("discrete", marks=pytest.mark.slow)]
-)
+continuous_discrete_slow = rows("time", ["continuous", pytest.param("discrete", marks=pytest.mark.slow)])
 
 ONE = np.eye(1)
 
@@ -167,7 +166,7 @@ def unsolvable(time):
 
 
 @both
-@pytest.mark.parametrize("name", unsolvable("continuous"))
+@rows("name", unsolvable("continuous"))
 def test_a_problem_without_a_solution_is_refused_with_the_reason(time, name):
     field, problem = unsolvable(time)[name]
     with pytest.raises(InputError) as caught:
@@ -317,7 +316,7 @@ ODD = {
 
 
 @both
-@pytest.mark.parametrize("name", ODD)
+@rows("name", ODD)
 def test_arguments_that_do_not_fit_are_refused_by_name(time, name):
     field, problem = ODD[name]
     with pytest.raises(InputError) as caught:
@@ -395,7 +394,7 @@ def steps(time, problem):
     return vector((np.full_like(A, scale), np.full_like(B, scale), weights[:n, :n], weights[n:, n:], weights[:n, n:]))
 
 
-@pytest.mark.parametrize(
+@rows(
     ("time", "n", "m"),
     [
         pytest.param("continuous", 4, 1, marks=pytest.mark.slow),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_continuous_lyapunov
+from tables import rows
 
 import cpjax
 from cpjax import InputError, State, paper
@@ -42,7 +43,7 @@ def stable_system(n, inputs, outputs):
     return A - (0.2 + np.max(np.linalg.eigvals(A).real)) * np.eye(n), B, C
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@rows("shape", SHAPES)
 def test_the_matrices_are_python_controls(shape):
     A, B, C = random_system(*shape)
     expected = control.ctrb(A, B)
@@ -61,7 +62,7 @@ def test_a_plain_vector_is_one_input_or_one_output():
     np.testing.assert_array_equal(observability_gramian(A, C[0], 1.0), observability_gramian(A, C, 1.0))
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@rows("shape", SHAPES)
 def test_rank_and_condition_are_numpys(shape):
     A, B, C = random_system(*shape)
     for found in (controllability(A, B), observability(A, C)):
@@ -73,8 +74,8 @@ def test_rank_and_condition_are_numpys(shape):
         np.testing.assert_allclose(found.singular_values, np.linalg.svd(matrix, compute_uv=False), rtol=1e-9)
 
 
-@pytest.mark.parametrize("plant", list(paper.PLANTS))
-@pytest.mark.parametrize("equilibrium", ["upright", "hanging"])
+@rows("plant", list(paper.PLANTS))
+@rows("equilibrium", ["upright", "hanging"])
 def test_the_papers_plants_are_controllable_and_observable_from_their_two_encoders(plant, equilibrium):
     A, B = papers_model(plant, equilibrium)
     assert controllability(A, B).full
@@ -94,7 +95,7 @@ def test_the_angle_alone_does_not_say_where_the_cart_is_and_the_position_alone_s
     assert observability(A, POSITION_AND_ANGLE[0]).full
 
 
-@pytest.mark.parametrize(
+@rows(
     ("A", "B", "rank"),
     [
         (-np.eye(2), [1.0, 2.0], 1),  # two equal tanks
@@ -114,7 +115,7 @@ def test_textbook_pairs_have_their_textbook_rank_and_so_have_their_duals(A, B, r
         assert controllability(A, B).condition == math.inf
 
 
-@pytest.mark.parametrize("shape", FEW_SHAPES)
+@rows("shape", FEW_SHAPES)
 def test_the_gramians_of_a_stable_system_for_all_time_are_those_of_lyapunovs_equation(shape):
     A, B, C = stable_system(*shape)
     expected = solve_continuous_lyapunov(A, -B @ B.T), solve_continuous_lyapunov(A.T, -C.T @ C)
@@ -142,8 +143,8 @@ def to_sixty_digits(A, B, horizon):
         return np.array(W.tolist(), dtype=float)
 
 
-@pytest.mark.parametrize("horizon", [1e-3, 0.3, 2.0, 8.0])
-@pytest.mark.parametrize("equilibrium", ["upright", "hanging"])
+@rows("horizon", [1e-3, 0.3, 2.0, 8.0])
+@rows("equilibrium", ["upright", "hanging"])
 def test_the_gramians_of_the_papers_plant_over_a_horizon_are_their_integrals(equilibrium, horizon):
     A, B = papers_model(equilibrium=equilibrium)
     C = np.array(POSITION_AND_ANGLE)
@@ -156,7 +157,7 @@ def test_the_gramians_of_the_papers_plant_over_a_horizon_are_their_integrals(equ
         np.testing.assert_array_equal(found, found.T)
 
 
-@pytest.mark.parametrize("shape", FEW_SHAPES)
+@rows("shape", FEW_SHAPES)
 def test_the_gramians_of_random_systems_over_a_horizon_are_their_integrals(shape):
     A, B, C = random_system(*shape)
     for found, right in (
@@ -166,15 +167,15 @@ def test_the_gramians_of_random_systems_over_a_horizon_are_their_integrals(shape
         assert np.max(np.abs(found - right)) <= 1e-11 * np.max(np.abs(right))
 
 
-@pytest.mark.parametrize("rate", [-2.0, 0.0, 2.0, 3.0])
-@pytest.mark.parametrize("horizon", [1e-9, 1.0, 100.0])
+@rows("rate", [-2.0, 0.0, 2.0, 3.0])
+@rows("horizon", [1e-9, 1.0, 100.0])
 def test_one_state_has_the_gramian_of_the_exponential_integral(rate, horizon):
     expected = math.expm1(2 * rate * horizon) / (2 * rate) if rate else horizon
     found = controllability_gramian([[rate]], [3.0], horizon)
     assert float(found[0, 0]) == pytest.approx(9.0 * expected, rel=1e-13)
 
 
-@pytest.mark.parametrize("horizon", [10.0, 1e3, 1e6])
+@rows("horizon", [10.0, 1e3, 1e6])
 def test_a_long_horizon_loses_nothing_of_a_stable_system(horizon):
     """The fast closed loop of the paper's LQR gain, up to 10^10 times its norm's inverse."""
     A, B = papers_model()
@@ -289,7 +290,7 @@ def test_rank_conditioning_and_their_derivatives_survive_jit_and_vmap():
     assert float(differences) == pytest.approx(float(jnp.sum(gradient * direction)), rel=1e-6)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@rows("dtype", [jnp.float32, jnp.float64])
 def test_a_gramians_error_is_a_few_roundings_per_norm_times_horizon_in_either_dtype(dtype):
     A, B = papers_model()
     for horizon in (0.5, 1.0, 2.0, 4.0):
@@ -306,7 +307,7 @@ def test_in_float32_the_papers_plant_is_controllable_too():
     assert structure.full
 
 
-@pytest.mark.parametrize("gramian", GRAMIANS)
+@rows("gramian", GRAMIANS)
 def test_an_unstable_system_has_no_gramian_for_all_time(gramian):
     A, B = papers_model()
     matrix = B if gramian is controllability_gramian else B.T
@@ -315,15 +316,15 @@ def test_an_unstable_system_has_no_gramian_for_all_time(gramian):
     assert np.all(np.isnan(jax.jit(gramian)(A, matrix)))
 
 
-@pytest.mark.parametrize("horizon", [-1.0, math.nan, "long", np.ones(2), True])
+@rows("horizon", [-1.0, math.nan, "long", np.ones(2), True])
 def test_a_horizon_that_is_none_is_refused_by_name(horizon):
     with pytest.raises(InputError) as refusal:
         controllability_gramian(*papers_model(), horizon)
     assert refusal.value.field == "horizon"
 
 
-@pytest.mark.parametrize("function", [controllability, controllability_matrix, controllability_gramian])
-@pytest.mark.parametrize(
+@rows("function", [controllability, controllability_matrix, controllability_gramian])
+@rows(
     ("field", "A", "B"),
     [("A", np.ones((2, 3)), np.ones(2)), ("B", np.eye(2), np.ones(3)), ("B", np.eye(2), np.ones((2, 0)))],
 )
@@ -333,8 +334,8 @@ def test_inputs_that_do_not_fit_are_refused_by_name(function, field, A, B):
     assert refusal.value.field == field
 
 
-@pytest.mark.parametrize("function", [observability, observability_matrix, observability_gramian])
-@pytest.mark.parametrize(
+@rows("function", [observability, observability_matrix, observability_gramian])
+@rows(
     ("field", "A", "C"),
     [("A", np.ones((2, 3)), np.ones(2)), ("C", np.eye(2), np.ones((3, 1))), ("C", np.eye(2), np.ones((0, 2)))],
 )

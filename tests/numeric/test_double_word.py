@@ -6,15 +6,15 @@ from fractions import Fraction
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from tables import rows
 
 from cpjax.numeric import double_word as dw
 from cpjax.numeric.double_word import DoubleWord, double_word, two_product, two_sum
 
 COUNT = 1000
-DTYPES = pytest.mark.parametrize("dtype", [np.float64, np.float32])
+DTYPES = rows("dtype", [np.float64, np.float32])
 MODES = {"eager": lambda f: f, "jit": jax.jit, "vmap": jax.vmap, "vmap in jit": lambda f: jax.jit(jax.vmap(f))}
-EVERY_MODE = pytest.mark.parametrize("mode", MODES)
+EVERY_MODE = rows("mode", MODES)
 EXACT = {"add": Fraction.__add__, "multiply": Fraction.__mul__, "divide": Fraction.__truediv__}
 
 
@@ -71,7 +71,7 @@ def test_a_product_of_two_floats_is_right_to_four_units_of_eps_squared(dtype, mo
 
 @DTYPES
 @EVERY_MODE
-@pytest.mark.parametrize("name", EXACT)
+@rows("name", EXACT)
 def test_the_error_of_an_operation_is_within_six_units_of_eps_squared_of_what_goes_into_it(dtype, mode, name):
     x, y = double_words(dtype, 2), double_words(dtype, 3)
     opposite = DoubleWord(-np.nextafter(x.high, dtype(0)), x.low)  # a sum with y that cancels almost altogether
@@ -86,8 +86,8 @@ def test_the_error_of_an_operation_is_within_six_units_of_eps_squared_of_what_go
 
 
 @DTYPES
-@pytest.mark.parametrize("mode", list(MODES)[1:])
-@pytest.mark.parametrize("operation", [two_sum, two_product], ids=lambda f: f.__name__)
+@rows("mode", list(MODES)[1:])
+@rows("operation", [two_sum, two_product], ids=lambda f: f.__name__)
 def test_a_compiler_changes_no_bit_of_the_operations_that_all_others_are_made_of(dtype, mode, operation):
     a, b = jnp.asarray(floats(dtype, 0)), jnp.asarray(floats(dtype, 1))
     for x, y in zip(operation(a, b), MODES[mode](operation)(a, b), strict=True):
@@ -147,7 +147,7 @@ def test_powers_of_two_move_no_digit(dtype):
 
 
 @DTYPES
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@rows("bad", [np.nan, np.inf])
 def test_what_is_not_finite_stays_so(dtype, bad):
     x, two = double_word(jnp.full((), bad, dtype)), double_word(jnp.full((), 2, dtype))
     for operation in (dw.add, dw.multiply, dw.divide):

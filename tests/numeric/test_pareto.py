@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from tables import rows
 
 from cpjax.numeric.pareto import hypervolume, nondominated
 
@@ -8,7 +9,7 @@ def beaten(points, i):
     return any(np.all(p <= points[i]) and np.any(p < points[i]) for p in points)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@rows("seed", range(20))
 def test_the_front_is_what_no_other_point_beats(seed):
     points = np.random.default_rng(seed).integers(0, 12, (40, 2)).astype(float)
     found = nondominated(points)
@@ -24,7 +25,7 @@ def test_points_that_are_not_finite_and_no_points_have_no_front():
     assert hypervolume(np.zeros((0, 2)), np.ones(2)) == 0.0
 
 
-@pytest.mark.parametrize("seed", range(5))
+@rows("seed", range(5))
 def test_the_hypervolume_is_the_share_of_random_points_that_are_dominated(seed):
     random = np.random.default_rng(seed)
     points = random.uniform(0.0, 1.3, (12, 2))

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 from scipy.stats import binom, binomtest, chi2_contingency
+from tables import rows
 
 from cpjax.errors import InputError
 from cpjax.numeric.statistics import mcnemar_p_value, two_proportion_p_value, wilson_interval
@@ -10,8 +11,8 @@ from cpjax.numeric.statistics import mcnemar_p_value, two_proportion_p_value, wi
 COUNTS = [(0, 1), (1, 1), (0, 8), (8, 8), (1, 8), (3, 8), (50, 100), (99, 100), (2048, 4096), (4095, 4096), (1, 10**6)]
 
 
-@pytest.mark.parametrize(("successes", "trials"), COUNTS)
-@pytest.mark.parametrize("confidence", [0.5, 0.9, 0.95, 0.99, 0.999999])
+@rows(("successes", "trials"), COUNTS)
+@rows("confidence", [0.5, 0.9, 0.95, 0.99, 0.999999])
 def test_the_wilson_interval_is_scipys(successes, trials, confidence):
     expected = binomtest(successes, trials).proportion_ci(confidence_level=confidence, method="wilson")
     assert wilson_interval(successes, trials, confidence) == pytest.approx(tuple(expected), rel=1e-12, abs=1e-15)
@@ -21,7 +22,7 @@ def test_the_default_confidence_is_95_percent():
     assert wilson_interval(3, 8) == wilson_interval(3, 8, 0.95)
 
 
-@pytest.mark.parametrize("trials", [1, 2, 5, 8, 33])
+@rows("trials", [1, 2, 5, 8, 33])
 def test_the_interval_contains_the_rate_and_stays_within_0_and_1(trials):
     for successes in range(trials + 1):
         low, high = wilson_interval(successes, trials)
@@ -46,7 +47,7 @@ def test_more_trials_at_one_rate_make_the_interval_narrower():
     assert widths == sorted(widths, reverse=True)
 
 
-@pytest.mark.parametrize("rate", [0.02, 0.2, 0.5, 0.9])
+@rows("rate", [0.02, 0.2, 0.5, 0.9])
 def test_the_interval_holds_the_true_rate_about_as_often_as_it_says(rate):
     trials = 200
     inside = [low <= rate <= high for low, high in (wilson_interval(k, trials) for k in range(trials + 1))]
@@ -54,7 +55,7 @@ def test_the_interval_holds_the_true_rate_about_as_often_as_it_says(rate):
     assert coverage == pytest.approx(0.95, abs=0.03)
 
 
-@pytest.mark.parametrize(
+@rows(
     ("a", "n", "b", "m"),
     [(3, 8, 5, 8), (10, 100, 30, 120), (4000, 4096, 4050, 4096), (1, 5, 4, 5), (500, 1000, 501, 1000), (0, 9, 3, 4)],
 )
@@ -63,7 +64,7 @@ def test_the_two_proportion_test_is_pearsons_chi_square_without_correction(a, n,
     assert two_proportion_p_value(a, n, b, m) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize("order", [(0, 5, 0, 9), (5, 5, 9, 9)])
+@rows("order", [(0, 5, 0, 9), (5, 5, 9, 9)])
 def test_rates_that_are_all_or_nothing_alike_are_no_evidence(order):
     assert two_proportion_p_value(*order) == 1.0
 
@@ -82,13 +83,13 @@ def test_opposite_rates_over_many_trials_have_a_vanishing_p_value_without_a_warn
     assert math.isfinite(p)
 
 
-@pytest.mark.parametrize(("counts", "field"), [((1, -1), "only_b"), ((-1, 2), "only_a"), ((1, True), "only_b")])
+@rows(("counts", "field"), [((1, -1), "only_b"), ((-1, 2), "only_a"), ((1, True), "only_b")])
 def test_mcnemars_test_names_a_bad_count(counts, field):
     with pytest.raises(InputError, match=field):
         mcnemar_p_value(*counts)
 
 
-@pytest.mark.parametrize(("a", "b"), [(0, 0), (0, 1), (3, 9), (9, 3), (50, 50), (400, 520), (0, 2000)])
+@rows(("a", "b"), [(0, 0), (0, 1), (3, 9), (9, 3), (50, 50), (400, 520), (0, 2000)])
 def test_mcnemars_test_is_scipys_binomial_test_of_the_discordant_pairs(a, b):
     expected = binomtest(a, a + b, 0.5).pvalue if a + b else 1.0
     assert mcnemar_p_value(a, b) == pytest.approx(expected, rel=1e-9, abs=1e-300)

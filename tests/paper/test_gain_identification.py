@@ -12,9 +12,11 @@ import pytest
 from oracles import jacobian, rough_plant
 from scipy.linalg import solve_continuous_are
 from scipy.signal import place_poles
+from tables import rows
 
 import cpjax
 from cpjax import CartPole, InputError, Motor, io, linearize, paper
+from cpjax.paper import gain_identification, plant_fit
 from cpjax.paper.gain_identification import Direction, GainAudit, audit_gains, document, write
 from cpjax.paper.plant_fit import PARAMETERS, Fit, least_squares
 from cpjax.paper.printed_gains import PrintedGain, printed_in_the_paper
@@ -22,7 +24,6 @@ from cpjax.plant import with_parameters
 from cpjax.pytree import cast
 from cpjax.show.figures import png
 from cpjax.show.gain_identification import direction_cells, findings, fit_cells, picture, shown_fits
-from cpjax.study import forensics, plant_fit
 
 APPENDIX = paper.appendix_plant()
 PAIR = ("torque_constant", "back_emf_constant")
@@ -62,7 +63,7 @@ def papers():
 # --- gains as printed -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@rows(
     ("text", "value", "unit"),
     [
         ("-24.7", -24.7, 0.1),
@@ -85,7 +86,7 @@ def test_the_digits_of_a_printed_number_say_how_precise_it_is(text, value, unit)
     assert gain.gain[1:] == gain.unit[1:] == (1.0, 1.0, 1.0)
 
 
-@pytest.mark.parametrize(
+@rows(
     "text", ["", "-", ".", "x", "1,5", "1_000", "1e", "1e1.5", "0x10", "inf", "nan", "1 2", "--1", "1\u00b2", 1.5, None]
 )
 def test_what_is_no_printed_number_is_refused(text):
@@ -93,7 +94,7 @@ def test_what_is_no_printed_number_is_refused(text):
         PrintedGain.lqr(["1", "1", "1", text], [1.0] * 4, 1.0)
 
 
-@pytest.mark.parametrize("text", ["1e400", "0e400", "1e-400", "1." + 400 * "0"])
+@rows("text", ["1e400", "0e400", "1e-400", "1." + 400 * "0"])
 def test_a_number_whose_size_or_last_digit_no_float_can_hold_is_refused(text):
     with pytest.raises(InputError, match=r"^placement gain = .*: must be a number that fits a float"):
         PrintedGain.placement(["1", text, "1", "1"], paper.POLES)
@@ -117,7 +118,7 @@ REFUSED_DESIGNS = [
 ]
 
 
-@pytest.mark.parametrize(("make", "field", "allowed"), REFUSED_DESIGNS)
+@rows(("make", "field", "allowed"), REFUSED_DESIGNS)
 def test_a_design_that_makes_no_sense_is_refused_by_name(make, field, allowed):
     with pytest.raises(InputError, match=rf"^{field} = .*: must be .*{re.escape(allowed)}"):
         make()
@@ -203,7 +204,7 @@ def test_progress_counts_the_sets_up_to_their_number():
 # --- made-up rigs, whose truth is known -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("names", [("pole_length", "cart_friction"), ("pivot_friction", "gear_ratio")])
+@rows("names", [("pole_length", "cart_friction"), ("pivot_friction", "gear_ratio")])
 def test_the_wrong_parameters_of_a_rig_are_recovered_as_precisely_as_the_directions_promise(names):
     rig = rough_plant()
     prints = prints_of(rig)
@@ -279,7 +280,7 @@ def test_the_gains_of_the_plant_itself_need_no_change():
         assert fit.values[0] == pytest.approx(value_of(rig, name), rel=room(audit, name))
 
 
-@pytest.mark.parametrize(("plant", "count"), [(rough_plant(), 6), (APPENDIX, 5)], ids=["rough", "appendix"])
+@rows(("plant", "count"), [(rough_plant(), 6), (APPENDIX, 5)], ids=["rough", "appendix"])
 def test_the_sensitivities_are_how_far_scipys_gains_move(plant, count):
     names = [n for n in PARAMETERS if value_of(plant, n) > 0.0]
     prints = prints_of(plant)
@@ -298,7 +299,7 @@ def test_the_sensitivities_are_how_far_scipys_gains_move(plant, count):
         return np.stack([gains_of_model(A, B, *design) / 0.01 for A, B in matrices])
 
     expected = jacobian(moved, np.zeros(len(names)), 1e-3)
-    directions = forensics._directions(tuple(prints), plant, tuple(names))
+    directions = gain_identification._directions(tuple(prints), plant, tuple(names))
     weights = np.array([[d.weights[n] for n in names] for d in directions])
     np.testing.assert_allclose(weights @ weights.T, np.eye(len(names)), atol=1e-12)
     sensitivities = np.array([d.sensitivity for d in directions])
@@ -407,7 +408,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("given", "field", "allowed"), REFUSED)
+@rows(("given", "field", "allowed"), REFUSED)
 def test_an_audit_that_makes_no_sense_is_refused_by_name(given, field, allowed):
     given = {"prints": PRINTS, "plant": APPENDIX, "parameters": PAIR, **SMALL, **given}
     prints, plant = given.pop("prints"), given.pop("plant")
@@ -529,7 +530,7 @@ def test_a_combination_is_shown_with_its_larger_weights_largest_first():
     assert direction_cells(Direction(250.0, weights)) == ["+0.80 gravity -0.60 pole_length", "250", "0.2 %"]
 
 
-@pytest.mark.parametrize("kind", ["pairs", "single", "knows nothing"])
+@rows("kind", ["pairs", "single", "knows nothing"])
 def test_a_picture_cuts_nothing_off_and_shows_what_is_unknown_below_everything_else(kind):
     audit = made_up(True)
     if kind != "pairs":

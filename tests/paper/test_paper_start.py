@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tables import rows
 
 import cpjax
 from cpjax import paper
@@ -15,7 +16,7 @@ from cpjax.pytree import Scalar, number, part, pytree
 APPENDIX, IDENTIFIED = paper.appendix_plant(), paper.identified_plant()
 PLANTS = {"appendix": APPENDIX, "identified": IDENTIFIED}
 both_plants = pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS)
-both_clocks = pytest.mark.parametrize("clock", ["sampled", "continuous"])
+both_clocks = rows("clock", ["sampled", "continuous"])
 SAMPLED = {"duration": 20.0, "dt": 0.002, "clock": "sampled"}
 
 
@@ -70,7 +71,7 @@ UNKICKED = {
 }
 
 
-@pytest.mark.parametrize("numbers", UNKICKED, ids=str)
+@rows("numbers", UNKICKED, ids=str)
 @both_clocks
 def test_only_rounding_starts_the_energy_law_without_a_kick_and_it_takes_its_time(numbers, clock):
     law = UnkickedSwingUp(APPENDIX, *numbers)
@@ -90,7 +91,7 @@ def test_when_the_unkicked_law_starts_depends_on_the_precision_of_the_arithmetic
     assert leave[0] < 0.5 * leave[1]
 
 
-@pytest.mark.parametrize(
+@rows(
     ("numbers", "seconds"),
     [
         ((0.2, 0.0, 0.0), 3.7),
@@ -143,7 +144,7 @@ CENTRED = paper.LAWS["corrected-centred"](APPENDIX)
 PHASES = (0.0, 0.7, math.pi / 2, 2.5, math.pi, 4.0, 5.5)
 
 
-@pytest.mark.parametrize("phase", PHASES)
+@rows("phase", PHASES)
 def test_the_kick_is_exactly_zero_outside_its_radius(phase):
     plain = UnkickedSwingUp(APPENDIX, CENTRED.energy_gain, CENTRED.cart_stiffness, CENTRED.cart_damping)
     for factor in (1.0001, 1.1, 2.0, 50.0):
@@ -159,7 +160,7 @@ def jacobian(law, s):
     return np.asarray(jax.grad(lambda vector: law.acceleration(cpjax.State.from_vector(vector)))(s.vector()))
 
 
-@pytest.mark.parametrize("phase", PHASES)
+@rows("phase", PHASES)
 def test_the_kicked_law_is_continuously_differentiable_where_the_kick_ends(phase):
     def jump(step):
         before, after = (swung(CENTRED, (1.0 + side * step) * CENTRED.kick_radius, phase) for side in (-1, 1))
@@ -170,7 +171,7 @@ def test_the_kicked_law_is_continuously_differentiable_where_the_kick_ends(phase
     assert jump(1e-6) < 1e-3 * jump(1e-3)
 
 
-@pytest.mark.parametrize("phase", PHASES)
+@rows("phase", PHASES)
 def test_the_kicked_law_is_continuously_differentiable_at_rest(phase):
     rest = jacobian(CENTRED, swung(CENTRED, 0.0, phase))
     for amplitude in (1e-4, 1e-6, 1e-8):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tables import rows
 
 from cpjax import HANGING, State, sample_starts
 from cpjax.plant.initial_states import START_SETS
@@ -20,7 +21,7 @@ RANGES = {
     "anywhere": {"x": (-0.3, 0.3), "x_dot": (-0.5, 0.5), "theta": (-math.pi, math.pi), "theta_dot": (-4.0, 4.0)},
     "rest": {"x": (0.0, 0.0), "x_dot": (0.0, 0.0), "theta": (math.pi, math.pi), "theta_dot": (0.0, 0.0)},
 }
-every_set = pytest.mark.parametrize("name", RANGES)
+every_set = rows("name", RANGES)
 
 
 def matrix(starts):
@@ -55,7 +56,7 @@ def test_components_that_vary_are_uncorrelated(name):
 
 
 @every_set
-@pytest.mark.parametrize("count", [1, 7])
+@rows("count", [1, 7])
 def test_the_starts_are_a_state_of_float64_arrays_of_that_length(name, count):
     starts = sample_starts(name, count, seed=1)
     assert type(starts) is State
@@ -70,7 +71,7 @@ def test_one_seed_always_gives_the_same_starts(name):
     np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("name", ["hanging", "anywhere"])
+@rows("name", ["hanging", "anywhere"])
 def test_two_seeds_give_different_starts_throughout(name):
     a, b = (matrix(sample_starts(name, 100, seed=seed)) for seed in (5, 6))
     assert not np.any((a == b)[:, np.ptp(a, axis=0) > 0])
@@ -102,7 +103,7 @@ def test_a_seed_keeps_its_starts_from_release_to_release():
 
 
 @every_set
-@pytest.mark.parametrize("dtype", [np.float32, jnp.float32, "float32"], ids=str)
+@rows("dtype", [np.float32, jnp.float32, "float32"], ids=str)
 def test_float32_starts_are_the_float64_ones_rounded(name, dtype):
     wide, narrow = sample_starts(name, 50, seed=1), sample_starts(name, 50, seed=1, dtype=dtype)
     for component in NAMES:

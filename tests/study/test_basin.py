@@ -5,6 +5,7 @@ import math
 import jax
 import numpy as np
 import pytest
+from tables import rows
 
 import cpjax
 from cpjax import paper
@@ -27,7 +28,7 @@ def test_every_cell_has_one_start_somewhere_inside_it():
     assert chart.middle == {"x": pytest.approx(0.05), "x_dot": 0.0}
 
 
-@pytest.mark.parametrize("cells", [20, 60])
+@rows("cells", [20, 60])
 def test_the_area_of_a_disc_lies_in_its_interval_and_the_interval_shrinks_with_the_cells(cells):
     """A disc of radius 1; its boundary passes through about 4 cells per cell of its diameter."""
     inside, widths = [], []
@@ -66,7 +67,7 @@ def test_a_cells_outcome_is_that_of_a_rollout_from_its_start():
     assert found["area_unit"] == "rad rad/s"
 
 
-@pytest.mark.parametrize(
+@rows(
     ("make", "field"),
     [
         (lambda: Axis("phi", 0.0, 1.0), "Axis.name"),
