@@ -29,6 +29,7 @@ MOVED = {
     "cpjax.study.plant_fit": "cpjax.paper.plant_fit",
     "cpjax.study.printed_gains": "cpjax.paper.printed_gains",
     "cpjax.study.reproduction": "cpjax.paper.reproduction",
+    "cpjax.tune.plan": "cpjax.tune.config",
     "cpjax.tune.starting": "cpjax.paper.initial",
 }
 """Where each module is now; modules below it moved with it."""

@@ -14,9 +14,9 @@ from cpjax.plant import CartPole
 from cpjax.plant.state import State
 from cpjax.sim.metrics import Fold, Metrics
 from cpjax.sim.sweep import sweep
+from cpjax.tune.config import TuningConfig
 from cpjax.tune.outcome import document, request
 from cpjax.tune.parameters import FreeParameters
-from cpjax.tune.plan import Plan
 from cpjax.tune.tuner import tune
 
 EVALUATION_SEED = 20_000
@@ -31,7 +31,7 @@ QUICK: dict[str, Any] = {
     "validation": 4,
     "final": 4,
 }
-"""For a `Plan` that only shows that it works."""
+"""For a `TuningConfig` that only shows that it works."""
 
 
 def located_rate(
@@ -46,7 +46,9 @@ def located_rate(
     return float(np.mean(good)), float(np.mean(np.asarray(found.settling_time)[good])) if good.any() else math.nan
 
 
-def tuned(out: Path, case: str, plant: CartPole, free: FreeParameters, plan: Plan) -> tuple[Hybrid, dict[str, Any]]:
+def tuned(
+    out: Path, case: str, plant: CartPole, free: FreeParameters, plan: TuningConfig
+) -> tuple[Hybrid, dict[str, Any]]:
     """The controller of a tuning, and its document; read from `out` if the same tuning is there already."""
     path, record, checkpoint = out / f"{case}.json", out / f"{case}.tune.json", out / f"{case}.npz"
     asked = json.loads(io.dump_json(request(plant, free, plan)))

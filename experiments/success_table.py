@@ -15,7 +15,7 @@ from _common import run
 from cpjax import io
 from cpjax.numeric.statistics import two_proportion_p_value
 from cpjax.paper import Design
-from cpjax.paper.reproduction import Setting, Variant, evaluate
+from cpjax.paper.reproduction import EvaluationConfig, Variant, evaluate
 from cpjax.show.figures import save_figure, success_rates
 from cpjax.study.summary import summarise
 
@@ -39,7 +39,7 @@ REFERENCE: dict[tuple[str, str, Design], float] = {
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     """Prints the table and writes success_table.json and success_table.png."""
-    setting = Setting(count=64 if quick else 4096, seed=seed)
+    setting = EvaluationConfig(count=64 if quick else 4096, seed=seed)
     rows = []
     for (law, plant, design), reference in REFERENCE.items():
         row = summarise(evaluate(Variant(law, plant, design, "printed"), setting))

@@ -18,8 +18,8 @@ from cpjax.presets import preset
 from cpjax.sim.sweep import sweep
 from cpjax.study.summary import summarise
 from cpjax.tune.baseline import baseline
+from cpjax.tune.config import TuningConfig
 from cpjax.tune.parameters import free_parameters
-from cpjax.tune.plan import Plan
 
 PLAN: dict[str, Any] = {"starts": "anywhere", "duration": 5.0, "horizon": 8.0, "horizon_dt": 0.01}
 
@@ -30,7 +30,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     starts = sample_starts("anywhere", 64 if quick else 10_000, seed=EVALUATION_SEED)
     rows = []
     for design in get_args(paper.Design)[: 1 if quick else None]:
-        plan = Plan(seed=seed, **(PLAN | (QUICK if quick else {})))
+        plan = TuningConfig(seed=seed, **(PLAN | (QUICK if quick else {})))
         free = free_parameters(baseline(design, plant))
         aimed, made = tuned(out, f"{design}-{seed}", plant, free, plan)
         for name, controller in (("hanging", preset(design)), ("anywhere", aimed)):

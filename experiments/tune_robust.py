@@ -29,8 +29,8 @@ from cpjax.presets import preset
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.rollout import measure
 from cpjax.tune.baseline import baseline
+from cpjax.tune.config import TuningConfig
 from cpjax.tune.parameters import free_parameters
-from cpjax.tune.plan import Plan
 from cpjax.tune.plants import UNCERTAIN, sample_plants
 
 SPREAD, PER_PLANT = 0.2, 4
@@ -51,7 +51,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     starts = sample_starts("hanging", PER_PLANT * count, seed=EVALUATION_SEED)
     controllers: dict[str, Hybrid] = {}
     for design in get_args(paper.Design)[: 1 if quick else None]:
-        plan = Plan(seed=seed, **(PLAN | (QUICK if quick else {})))
+        plan = TuningConfig(seed=seed, **(PLAN | (QUICK if quick else {})))
         free = free_parameters(baseline(design, nominal))
         controllers[f"{design}, nominal"] = preset(design)
         controllers[f"{design}, over plants"], _ = tuned(out, f"{design}-{seed}", nominal, free, plan)

@@ -26,8 +26,8 @@ from cpjax.presets import PRESETS
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.sweep import sweep
 from cpjax.study.summary import summarise
+from cpjax.tune.config import TuningConfig
 from cpjax.tune.parameters import free_parameters
-from cpjax.tune.plan import Plan
 
 CASES = (("appendix", "bland", 5), ("appendix", "paper", 5), ("identified", "bland", 1))
 
@@ -44,11 +44,11 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     best: dict[str, float] = {}
     for name, design, begin, number in cases[:1] if quick else cases:
         plant = paper.PLANTS[name]()
-        plan = Plan(seed=number, **(QUICK if quick else {}))
+        plan = TuningConfig(seed=number, **(QUICK if quick else {}))
         free = free_parameters(initial_controller(begin, design, plant))
         case = f"{name}-{design}-{begin}-{number}"
         controller, made = tuned(out, case, plant, free, plan)
-        judged = judge(plant, controller, 64 if quick else 10_000)
+        judged = evaluate(plant, controller, 64 if quick else 10_000)
         row = {"plant": name, "design": design, "from": begin, "seed": number, **judged}
         row |= {key: made[key] for key in ("score", "value_steps", "gradient_steps", "seconds")}
         rows.append(row)
@@ -68,7 +68,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     return rows
 
 
-def judge(plant: CartPole, controller: Hybrid, count: int) -> dict[str, Any]:
+def evaluate(plant: CartPole, controller: Hybrid, count: int) -> dict[str, Any]:
     """The protocol's evaluation, and the checks that a law does not live off the discretisation."""
     starts = sample_starts("hanging", count, seed=EVALUATION_SEED)
     some = jax.tree.map(lambda column: column[: max(16, count // 5)], starts)

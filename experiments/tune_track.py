@@ -21,9 +21,9 @@ from cpjax.sim.metrics import ProtocolMetrics
 from cpjax.sim.sweep import sweep
 from cpjax.study.summary import summarise
 from cpjax.tune.baseline import baseline
+from cpjax.tune.config import TuningConfig
 from cpjax.tune.objective import Goal
 from cpjax.tune.parameters import free_parameters
-from cpjax.tune.plan import Plan
 
 LIMITS = (0.8, 0.6, 0.5)
 FREELY: dict[str, Any] = {"duration": 6.0, "horizon": 10.0, "horizon_dt": 0.01}
@@ -52,7 +52,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
         goal = Goal(track=3.0, track_limit=limit)
         tunings = []
         for number in range(seed, seed + (1 if quick else 3)):
-            plan = Plan(seed=number, goal=goal, **((FURTHER if further else FREELY) | (QUICK if quick else {})))
+            plan = TuningConfig(seed=number, goal=goal, **((FURTHER if further else FREELY) | (QUICK if quick else {})))
             tunings.append((number, *tuned(out, f"{limit:g}m-{design}-{number}", plant, free, plan)))
         number, controller, made = min(tunings, key=lambda tuning: float(tuning[2]["score"]))
         fold = ProtocolMetrics(track_limit=limit)

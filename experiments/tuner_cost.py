@@ -3,7 +3,7 @@
     python experiments/tuner_cost.py
 
 Values: the settling time of 192 starts, 5 s, a control held over 4 ms, as a search without gradients asks for them.
-With a gradient: a step of `cpjax tune` as a `Plan` has it, 8 controllers and 16 starts each, 3 s at 20 ms, located
+With a gradient: a step of `cpjax tune` with 8 controllers and 16 starts each, 3 s at 20 ms, located
 switching, in the same nine parameters. And a step of `cpjax pareto`: time and all costs at once, as many controllers
 as one core has, 8 starts each, 8 s, the supply a parameter of each. Each runs with and without two options of XLA's
 CPU compiler, each combination in a process of its own, and all processes in turn; the best of each counts.
@@ -29,12 +29,12 @@ from cpjax.plant.initial_states import sample_starts
 from cpjax.plant.state import State
 from cpjax.sim.metrics import TimeOutside
 from cpjax.sim.rollout import measure
-from cpjax.study.fronts.config import FrontPlan
-from cpjax.study.fronts.evaluator import BATCH, Judge
+from cpjax.study.fronts.config import FrontConfig
+from cpjax.study.fronts.evaluator import BATCH, Evaluator
 from cpjax.study.fronts.trace import Aim, Tracer
 from cpjax.tune.baseline import baseline
+from cpjax.tune.config import TuningConfig
 from cpjax.tune.parameters import free_parameters
-from cpjax.tune.plan import Plan
 
 FUSION, LOOPS = "xla_cpu_use_multi_output_fusion=true", "xla_cpu_small_while_loop_byte_threshold=16777216"
 OPTIONS = {"none": "", "fusion and small loops": f"{FUSION},{LOOPS}"}
@@ -82,7 +82,7 @@ def _in_a_process(design: str, work: str, options: str, quick: bool) -> float:
 def _measure(design: Any, work: str, quick: bool) -> float:
     plant = paper.appendix_plant()
     free = free_parameters(baseline(design, plant))
-    plan = Plan()
+    plan = TuningConfig()
     if work == "fronts":
         return _measure_fronts(plant, design, quick)
     with_gradient = (plan.restarts, plan.batch, plan.duration, plan.dt)
@@ -114,18 +114,18 @@ def _measure(design: Any, work: str, quick: bool) -> float:
 
 
 def _measure_fronts(plant: Any, design: Any, quick: bool) -> float:
-    plan = FrontPlan()
-    judge = Judge(plant, design, plan)
-    tracer = Tracer(judge, plan)
+    plan = FrontConfig()
+    evaluator = Evaluator(plant, design, plan)
+    tracer = Tracer(evaluator, plan)
     count = 2 if quick else 3 * (plan.bounds + 1)
     random = np.random.default_rng(1)
-    start = np.asarray(judge.free.start())
+    start = np.asarray(evaluator.free.start())
     vectors = jnp.asarray(start + 0.1 * random.standard_normal((count, len(start))))
     aims = Aim(jnp.full((count, 3), 0.01), jnp.full((count,), 12.0))
     times = []
     for step in range(2 if quick else 8):
         began = time.perf_counter()
-        jax.block_until_ready(tracer.gradient(vectors, aims, judge.starts(plan.batch, BATCH, step)))  # type: ignore[no-untyped-call]  # untyped in JAX
+        jax.block_until_ready(tracer.gradient(vectors, aims, evaluator.starts(plan.batch, BATCH, step)))  # type: ignore[no-untyped-call]  # untyped in JAX
         times.append(time.perf_counter() - began)
     return count * plan.batch * tracer.steps_of_a_run / min(times[1:])
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cpjax.cli import make_parser
-from cpjax.paper.reproduction import Setting, reproduce
+from cpjax.paper.reproduction import EvaluationConfig, reproduce
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -90,7 +90,7 @@ def test_every_test_that_the_paper_page_names_exists():
 
 @pytest.mark.slow
 def test_the_success_table_of_the_readme_is_what_reproduce_finds():
-    rows = reproduce(Setting(count=4096, seed=1))
+    rows = reproduce(EvaluationConfig(count=4096, seed=1))
     table = re.findall(r"^\| ([\w-]+) \| (appendix|identified) \| ([\d.]+) %.*\| ([\d.]+) %.*\|$", README, re.MULTILINE)
     assert len(table) == 8
     for law, plant, *printed in table:

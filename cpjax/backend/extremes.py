@@ -10,24 +10,24 @@ from cpjax.pytree import Scalar
 
 
 @jax.custom_jvp
-def larger(a: Scalar, b: Scalar) -> jax.Array:
+def fast_maximum(a: Scalar, b: Scalar) -> jax.Array:
     """The larger of the two, b where either is NaN. The derivative is that of `jnp.maximum`: half each where equal."""
     return jnp.where(a > b, a, b)
 
 
 @jax.custom_jvp
-def smaller(a: Scalar, b: Scalar) -> jax.Array:
+def fast_minimum(a: Scalar, b: Scalar) -> jax.Array:
     """The smaller of the two, b where either is NaN. The derivative is that of `jnp.minimum`: half each where equal."""
     return jnp.where(a < b, a, b)
 
 
-@larger.defjvp
+@fast_maximum.defjvp
 def _larger_jvp(primals: tuple[Scalar, Scalar], tangents: tuple[Scalar, Scalar]) -> tuple[jax.Array, jax.Array]:
     _, tangent = jax.jvp(jnp.maximum, primals, tangents)
-    return larger(*primals), tangent
+    return fast_maximum(*primals), tangent
 
 
-@smaller.defjvp
+@fast_minimum.defjvp
 def _smaller_jvp(primals: tuple[Scalar, Scalar], tangents: tuple[Scalar, Scalar]) -> tuple[jax.Array, jax.Array]:
     _, tangent = jax.jvp(jnp.minimum, primals, tangents)
-    return smaller(*primals), tangent
+    return fast_minimum(*primals), tangent

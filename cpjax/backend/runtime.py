@@ -67,7 +67,7 @@ def configure_cpu(devices: int | None = None, *, gradients: bool = False) -> boo
     except RuntimeError as problem:
         message = "configure_cpu is too late: JAX has started. Call it before anything is computed with JAX"
         raise RuntimeError(message) from problem
-    if gradients or not is_tested() or _FLAG in flags:
+    if gradients or not jaxlib_is_tested() or _FLAG in flags:
         return False
     os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}={_OPTIONS}".strip()
     return True
@@ -112,7 +112,7 @@ def _cpu() -> str:
 
 
 @functools.cache
-def fast_loops() -> bool:
+def compiler_fuses_loops() -> bool:
     """Whether the compiler makes one function of a small loop; starts JAX. It is asked by compiling one."""
     if jax.default_backend() != "cpu":
         return False
@@ -126,7 +126,7 @@ def fast_loops() -> bool:
 
 
 @functools.cache
-def is_tested() -> bool:
+def jaxlib_is_tested() -> bool:
     """Whether jaxlib is a version with which all that XLA does not document was tested. Warns, once, if it is not."""
     tested = version("jaxlib") in TESTED
     if not tested:

@@ -1,8 +1,8 @@
 """How XLA's compiler for CPUs is told what to make one function of.
 
 By default it makes many small functions of one step of a simulation and calls them one by one at every step, which
-takes longer than the arithmetic. `one_function` ends that: a whole loop becomes one function. In that function several
-results with a common part each compute it for themselves, unless the part is a function too: `part_of_step`. (With the
+takes longer than the arithmetic. `single_kernel` ends that: a whole loop becomes one function. In that function several
+results with a common part each compute it for themselves, unless the part is a function too: `outline`. (With the
 options that `cpjax.configure_cpu` sets, the compiler does both better by itself, and nothing is done here.)
 
 Both put attributes on the call of one `jax.jit` inside another. XLA does not document them: they are put there only
@@ -44,7 +44,7 @@ stablehlo.transpose stablehlo.xor
 """Those operations that the compiler can write into one function."""
 
 
-def one_function(function: Callable[..., Any], *, stacks: bool = False) -> Callable[..., Any]:
+def single_kernel(function: Callable[..., Any], *, stacks: bool = False) -> Callable[..., Any]:
     """`function`, compiled as one function on a CPU: forward, and in each pass of a derivative.
 
     To be called under `jax.jit`, with all that is differentiated among the arguments.
@@ -52,12 +52,12 @@ def one_function(function: Callable[..., Any], *, stacks: bool = False) -> Calla
     Args:
       stacks: the function returns a pair, whose second part is stacked by a loop, and may be large.
     """
-    return function if runtime.fast_loops() else _called(function, _whole, stacks)
+    return function if runtime.compiler_fuses_loops() else _called(function, _whole, stacks)
 
 
-def part_of_step(function: Callable[..., Any]) -> Callable[..., Any]:
+def outline(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function`, as a function of its own where the compiler would otherwise compute what it does several times."""
-    return function if runtime.fast_loops() else _called(function, _part, False)
+    return function if runtime.compiler_fuses_loops() else _called(function, _part, False)
 
 
 class _Marks:
@@ -73,7 +73,7 @@ class _Marks:
         _define(self.cotangents, self.arguments)
 
         def lower(context: Any, *values: Any) -> list[Any]:
-            if max(aval.size for aval in context.avals_in) <= LARGEST and runtime.is_tested():
+            if max(aval.size for aval in context.avals_in) <= LARGEST and runtime.jaxlib_is_tested():
                 mark(context.module_context.symbol_table, [value.owner for value in values])
             return list(values)
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from cpjax.backend.single_kernel import part_of_step
+from cpjax.backend.single_kernel import outline
 from cpjax.pytree import Scalar
 
 # Range reduction of Cody and Waite: pi/2 in three parts, the first short enough for n * part to be exact.
@@ -51,7 +51,7 @@ def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
     """
     angle = jnp.asarray(angle)
     angle = angle.astype(jnp.result_type(angle, float)) if not jnp.issubdtype(angle.dtype, jnp.floating) else angle
-    s, c, quadrant = part_of_step(_reduced)(angle)
+    s, c, quadrant = outline(_reduced)(angle)
     odd = (quadrant & 1) == 1
     sin, cos = jnp.where(odd, c, s), jnp.where(odd, s, c)
     return jnp.where(quadrant >= 2, -sin, sin), jnp.where((quadrant == 1) | (quadrant == 2), -cos, cos)
@@ -78,10 +78,10 @@ def _sin_cos_jvp(primals: tuple[Scalar], tangents: tuple[jax.Array]) -> tuple[_P
 
 
 LARGEST_TURN = 0.1
-"""Up to which `turned` is accurate [rad]."""
+"""Up to which `rotate_by` is accurate [rad]."""
 
 
-def turned(sin: jax.Array, cos: jax.Array, angle: jax.Array) -> tuple[jax.Array, jax.Array]:
+def rotate_by(sin: jax.Array, cos: jax.Array, angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Sine and cosine of an angle that is `angle` [rad] beyond one whose sine and cosine are known.
 
     Accurate to 2 ulp of 1 for |angle| <= LARGEST_TURN, and cheaper than `sin_cos`: no range to reduce, short series.

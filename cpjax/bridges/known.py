@@ -19,7 +19,7 @@ EXPRESSED = (
 UNTRACEABLE = "JAX cannot trace through another package"
 
 
-def known_plant(plant: Any) -> CartPole:
+def concrete_plant(plant: Any) -> CartPole:
     """`plant` with Python's floats for numbers; a matrix of somebody's own motor stays an array.
 
     Raises:
@@ -27,7 +27,7 @@ def known_plant(plant: Any) -> CartPole:
     """
     if not isinstance(plant, CartPole):
         raise InputError("plant", plant, "a cpjax.CartPole")
-    refuse_unknown("plant", plant)
+    require_concrete("plant", plant)
     return jax.tree.map(lambda leaf: leaf if np.ndim(leaf) else float(leaf), plant)
 
 
@@ -37,7 +37,7 @@ def unexpressed(part: Any) -> dict[str, Number]:
     return {name: rule for name, rule in declared if name not in EXPRESSED and getattr(part, name) != rule.neutral}
 
 
-def refuse_unknown(name: str, tree: Any) -> None:
+def require_concrete(name: str, tree: Any) -> None:
     """Raises InputError unless the fields of `tree` are in range and their numbers known."""
     check(name, tree)
     if any(is_traced(leaf) for leaf in jax.tree.leaves(tree)):

@@ -3,7 +3,7 @@
 import math
 from typing import Literal
 
-from cpjax.bridges.known import known_plant, unexpressed
+from cpjax.bridges.known import concrete_plant, unexpressed
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor
 from cpjax.pytree import Number
@@ -52,7 +52,7 @@ def model_xml(
       InputError: the class of `plant` or of its motor is not cpjax's own; a parameter that the model does not hold is
         not zero (or what is declared neutral); a number is not known; dt is not positive.
     """
-    plant = known_plant(plant)
+    plant = concrete_plant(plant)
     motor = plant.motor
     for path, part, cls in (("plant", plant, CartPole), ("plant.motor", motor, Motor)):
         if type(part) is not cls:

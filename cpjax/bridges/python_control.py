@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from cpjax.bridges.known import UNTRACEABLE, known_plant, refuse_unknown, unexpressed
+from cpjax.bridges.known import UNTRACEABLE, concrete_plant, require_concrete, unexpressed
 from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import Law, ModalController, SingleLaw, as_controller
@@ -50,7 +50,7 @@ def state_space(
       InputError: as `cpjax.linearize`; a plant or equilibrium that JAX is tracing; an output that is no state, or is
         named twice.
     """
-    model = linearize(known_plant(plant), equilibrium)
+    model = linearize(concrete_plant(plant), equilibrium)
     if is_traced(model.A):
         raise InputError("equilibrium", equilibrium, f"known; {UNTRACEABLE}")
     A, B = (np.asarray(M, dtype=np.float64) for M in model)
@@ -71,7 +71,7 @@ def plant_system(plant: CartPole) -> control.NonlinearIOSystem:
     Raises:
       InputError: `plant` is no CartPole with known numbers.
     """
-    plant = known_plant(plant)
+    plant = concrete_plant(plant)
     saturate = _saturation(plant.motor)
 
     def update(t: float, state: Vector, inputs: Vector, params: Any) -> tuple[Any, ...]:
@@ -103,10 +103,10 @@ def closed_loop_system(
       InputError: bad arguments, named; `controller` without a control period, if it may remember its mode: laws
         do not, nor does a `cpjax.Hybrid` whose gate has hysteresis 0.
     """
-    plant, controller = known_plant(plant), as_controller(controller)
+    plant, controller = concrete_plant(plant), as_controller(controller)
     if not isinstance(controller, ModalController):
         raise InputError("controller", controller, "a law, or a controller whose only memory is its mode")
-    refuse_unknown("controller", controller)
+    require_concrete("controller", controller)
     if control_period is not None:
         return _sampled_loop(plant, controller, control_period, dt)
     if dt is not None:
@@ -130,7 +130,7 @@ def gain_array(law: StateFeedback) -> Vector:
     """
     if not isinstance(law, StateFeedback):
         raise InputError("law", law, "a cpjax.StateFeedback")
-    refuse_unknown("law", law)
+    require_concrete("law", law)
     reference = [float(getattr(law.reference, name)) for name in NAMES]
     if any(reference):
         raise InputError("law.reference", law.reference, "the origin; no gain represents another")

@@ -21,7 +21,7 @@ from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.plant.state import NAMES, UNITS
 from cpjax.sim.metrics import Metrics
-from cpjax.study.basin import MOST_CELLS, Axis, Map, area, document
+from cpjax.study.basin import MOST_CELLS, Axis, StartGrid, area, document
 from cpjax.study.design_check import DesignCheck, check_design
 from cpjax.study.recording import read_sweep, record_sweep
 
@@ -98,7 +98,7 @@ def drawn(
     parts: Path,
     plant: CartPole,
     controllers: Mapping[str, Hybrid],
-    chart: Map,
+    chart: StartGrid,
     setting: dict[str, Any],
     notes: Sequence[str] = (),
 ) -> dict[str, dict[str, Any]]:
@@ -130,7 +130,7 @@ def drawn(
     return rows
 
 
-def chart_of(chosen: dict[str, Any], seed: int) -> Map:
+def chart_of(chosen: dict[str, Any], seed: int) -> StartGrid:
     """The map that the options describe."""
 
     cells = chosen.get("cells", 512)
@@ -145,7 +145,7 @@ def chart_of(chosen: dict[str, Any], seed: int) -> Map:
 
     across, up = axis(chosen.get("across", "theta")), axis(chosen.get("up", "theta_dot"))
     others = {name: tuple(chosen[name]) for name in NAMES if name in chosen and name not in (across.name, up.name)}
-    return Map(across, up, others, seed)
+    return StartGrid(across, up, others, seed)
 
 
 def file_of(name: str) -> str:
@@ -153,7 +153,9 @@ def file_of(name: str) -> str:
     return name.replace("/", "-").removesuffix(".json").removesuffix(".toml").lstrip(".-") + ".npz"
 
 
-def mapped(parts: Path, plant: CartPole, chart: Map, name: str, controller: Hybrid, setting: dict[str, Any]) -> Metrics:
+def mapped(
+    parts: Path, plant: CartPole, chart: StartGrid, name: str, controller: Hybrid, setting: dict[str, Any]
+) -> Metrics:
     """The metrics of a controller's map, recorded in `parts`, or from there where they are complete."""
     path = parts / file_of(name)
     if path.exists():
@@ -173,7 +175,7 @@ def mapped(parts: Path, plant: CartPole, chart: Map, name: str, controller: Hybr
     return metrics
 
 
-def panel_of(plant: CartPole, chart: Map, name: str, controller: Hybrid, metrics: Metrics) -> "Panel":
+def panel_of(plant: CartPole, chart: StartGrid, name: str, controller: Hybrid, metrics: Metrics) -> "Panel":
     """What the picture needs of one controller."""
     from cpjax.show.basin import Panel
 

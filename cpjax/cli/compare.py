@@ -16,7 +16,7 @@ from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid, LqrWeights, PoleFactors
 from cpjax.errors import InputError
 from cpjax.paper.comparison import Compared, Entry, best, compare, document, entries
-from cpjax.paper.reproduction import DESIGNS, Setting
+from cpjax.paper.reproduction import DESIGNS, EvaluationConfig
 from cpjax.plant import CartPole
 from cpjax.plant.state import NAMES, State
 from cpjax.sim.rollout import rollout
@@ -45,7 +45,7 @@ def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
     plant = build_plant(sections["plant"])
-    setting = Setting(seed=given.seed, **sections["evaluation"])
+    setting = EvaluationConfig(seed=given.seed, **sections["evaluation"])
     files = dict(sections["tuned"])
     limit = files.pop("track_limit", float("inf"))
     tuned = {design: _loaded(design, files[design]) for design in DESIGNS if design in files}
@@ -64,7 +64,7 @@ def run(given: argparse.Namespace) -> int:
 def compared(
     out: Path,
     plant: CartPole,
-    setting: Setting,
+    setting: EvaluationConfig,
     tuned: Mapping[paper.Design, Hybrid],
     track_limit: float = float("inf"),
     notes: Sequence[str] = (),

@@ -16,13 +16,13 @@ from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
 from cpjax.errors import InputError
 from cpjax.paper.comparison import Compared, compare, entries
-from cpjax.paper.reproduction import DESIGNS, Setting
+from cpjax.paper.reproduction import DESIGNS, EvaluationConfig
 from cpjax.plant import CartPole
-from cpjax.study.fronts.config import COSTS, FrontPlan
+from cpjax.study.fronts.config import COSTS, FrontConfig
 
 if TYPE_CHECKING:  # imports of it take a while
     from cpjax.show.front import Curve
-    from cpjax.study.fronts.reference_point import Yardstick
+    from cpjax.study.fronts.reference_point import ReferencePoints
 
 Found: TypeAlias = dict[paper.Design, dict[str, Any]]
 """The fronts of each design, as plain values."""
@@ -38,7 +38,7 @@ _PLANNED = {
 }
 
 OPTIONS = [
-    *(Option("front", key, f"{text} (default {getattr(FrontPlan, key)})", int) for key, text in _PLANNED.items()),
+    *(Option("front", key, f"{text} (default {getattr(FrontConfig, key)})", int) for key, text in _PLANNED.items()),
     Option(
         "front",
         "supplies",
@@ -74,7 +74,7 @@ def run(given: argparse.Namespace) -> int:
     for supply in supplies:
         if not _LOWEST_SUPPLY <= supply <= _HIGHEST_SUPPLY:
             raise InputError("supplies", supply, f"from {_LOWEST_SUPPLY:g} to {_HIGHEST_SUPPLY:g} V")
-    plan = FrontPlan(seed=given.seed, **chosen)
+    plan = FrontConfig(seed=given.seed, **chosen)
     notes = notes_on(sections["plant"], plant)
     announce("pareto", notes)
     found = made(given.out, given.out / "pareto.parts", plant, plan, supplies, notes)
@@ -87,16 +87,16 @@ def run(given: argparse.Namespace) -> int:
 
 
 def made(
-    out: Path, parts: Path, plant: CartPole, plan: FrontPlan, supplies: tuple[float, ...], notes: Sequence[str] = ()
+    out: Path, parts: Path, plant: CartPole, plan: FrontConfig, supplies: tuple[float, ...], notes: Sequence[str] = ()
 ) -> Found:
     """The fronts of both designs, with pareto.json, pareto.png and supplies.png written; until then what is done is in
     the folder `parts`.
     """
-    from cpjax.study.fronts.reference_point import yardstick
+    from cpjax.study.fronts.reference_point import reference_points
 
     request = {"plan": dataclasses.asdict(plan), "plant": io.encode(plant), "supplies": supplies}
     with io.parts_of(parts, {**request, "versions": io.versions()}):
-        measure = yardstick(plant, plan, supplies)
+        measure = reference_points(plant, plan, supplies)
         found = {design: traced(parts / design, plant, design, plan, supplies, measure) for design in DESIGNS}
         known = known_controllers(plant, plan)
         document = {
@@ -113,12 +113,14 @@ def made(
     return found
 
 
-def known_controllers(plant: CartPole, plan: FrontPlan) -> list[tuple[str, Compared]]:
+def known_controllers(plant: CartPole, plan: FrontConfig) -> list[tuple[str, Compared]]:
     """The paper's printed gains and the controllers that come with cpjax, from the starts that measure the points."""
     from cpjax.study.fronts.evaluator import FINAL
-    from cpjax.tune.descent import seed_of
+    from cpjax.tune.descent import derive_seed
 
-    setting = Setting(count=plan.final, seed=seed_of(plan.seed, FINAL, 0), duration=plan.horizon, dt=plan.final_dt)
+    setting = EvaluationConfig(
+        count=plan.final, seed=derive_seed(plan.seed, FINAL, 0), duration=plan.horizon, dt=plan.final_dt
+    )
     chosen = [one for one in entries(plant) if one.gains != "computed"]
     own = io.encode(plant) == io.encode(paper.appendix_plant())
     preset = "tuned, as shipped" if own else "as shipped for the appendix's plant"
@@ -130,9 +132,9 @@ def traced(
     folder: Path,
     plant: CartPole,
     design: paper.Design,
-    plan: FrontPlan,
+    plan: FrontConfig,
     supplies: tuple[float, ...],
-    measure: "Yardstick",
+    measure: "ReferencePoints",
 ) -> dict[str, Any]:
     """A design's fronts as plain values, kept in `folder`, from where an interrupted run goes on."""
     path = folder / "fronts.json"

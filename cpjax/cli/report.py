@@ -10,7 +10,7 @@ from cpjax.cli.options import EVALUATION_OPTIONS, Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.reproduce import print_rows, rows_of
 from cpjax.errors import InputError
-from cpjax.paper.reproduction import Setting
+from cpjax.paper.reproduction import EvaluationConfig
 from cpjax.study.basin import MOST_CELLS
 
 OPTIONS = [
@@ -42,7 +42,7 @@ def run(given: argparse.Namespace) -> int:
     chosen = sections["report"]
     if not 0 <= chosen.get("cells", 192) <= MOST_CELLS or chosen.get("cells") == 1:
         raise InputError("cells", chosen["cells"], f"0, or a whole number from 2 to {MOST_CELLS}")
-    setting = Setting(seed=given.seed, **sections["evaluation"])
+    setting = EvaluationConfig(seed=given.seed, **sections["evaluation"])
     per_axis, studies = chosen.get("cells", 192), chosen.get("studies", "quick")
     asked = {"setting": dataclasses.asdict(setting), "cells": per_axis, "studies": studies, "versions": io.versions()}
     with io.parts_of(given.out / "report.parts", asked) as parts:
@@ -53,7 +53,7 @@ def run(given: argparse.Namespace) -> int:
 
 
 def written(
-    given: argparse.Namespace, parts: Path, setting: Setting, per_axis: int, studies: str
+    given: argparse.Namespace, parts: Path, setting: EvaluationConfig, per_axis: int, studies: str
 ) -> list[dict[str, Any]]:
     """The page and all that stands beside it; the rows of the reproduction. What long studies save is in `parts`."""
     rows = rows_of(given, setting)

@@ -27,10 +27,10 @@ from cpjax.show import gradients as gradients_text
 from cpjax.show.figures import DESIGN_NAMES, save_figure
 from cpjax.show.page import Page
 from cpjax.study.design_check import check_design, document
-from cpjax.study.fronts.config import FrontPlan
+from cpjax.study.fronts.config import FrontConfig
 from cpjax.tune.baseline import baseline
+from cpjax.tune.config import TuningConfig
 from cpjax.tune.parameters import free_parameters
-from cpjax.tune.plan import Plan
 
 QUICK_FRONTS: Mapping[str, Any] = {
     "bounds": 11,
@@ -40,9 +40,9 @@ QUICK_FRONTS: Mapping[str, Any] = {
     "semifinal": 128,
     "final": 256,
 }
-"""Of a `FrontPlan`."""
+"""Of a `FrontConfig`."""
 QUICK_TUNING: Mapping[str, Any] = {"candidates": 1023, "restarts": 4, "batch": 8, "steps": 36}
-"""Of a `Plan`."""
+"""Of a `TuningConfig`."""
 QUICK_AUDIT: Mapping[str, Any] = {"count": 4, "duration": 3.0, "dt": 0.002}
 """Of `cpjax audit-gradients`."""
 
@@ -129,7 +129,7 @@ def tuning(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
     )
     rows = []
     for design in DESIGNS[:1] if size == "quick" else DESIGNS:
-        plan = Plan(seed=given.seed, **(QUICK_TUNING if size == "quick" else {}))
+        plan = TuningConfig(seed=given.seed, **(QUICK_TUNING if size == "quick" else {}))
         free = free_parameters(baseline(design, plant))
         folder = given.out / f"tune-{design}"
         found = tuned(folder, plant, free, plan, parts / f"tune-{design}.npz")
@@ -224,7 +224,7 @@ def basins(page: Page, given: argparse.Namespace, parts: Path, cells: int) -> No
 
 def fronts(page: Page, given: argparse.Namespace, parts: Path, size: str) -> None:
     """What settling faster costs."""
-    plan = FrontPlan(seed=given.seed, **(QUICK_FRONTS if size == "quick" else {}))
+    plan = FrontConfig(seed=given.seed, **(QUICK_FRONTS if size == "quick" else {}))
     found = pareto.made(
         given.out, parts / "pareto", paper.appendix_plant(), plan, () if size == "quick" else pareto.SUPPLIES
     )

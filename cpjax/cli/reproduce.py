@@ -8,7 +8,7 @@ from cpjax.cli.options import EVALUATION_OPTIONS, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
-from cpjax.paper.reproduction import Setting, reproduce
+from cpjax.paper.reproduction import EvaluationConfig, reproduce
 
 
 def add_command(commands: Any) -> None:
@@ -41,12 +41,12 @@ def run(given: argparse.Namespace) -> int:
     return 0
 
 
-def setting_of(given: argparse.Namespace) -> Setting:
+def setting_of(given: argparse.Namespace) -> EvaluationConfig:
     """The evaluation's setting from the options."""
-    return Setting(seed=given.seed, **resolve(given, EVALUATION_OPTIONS)["evaluation"])
+    return EvaluationConfig(seed=given.seed, **resolve(given, EVALUATION_OPTIONS)["evaluation"])
 
 
-def rows_of(given: argparse.Namespace, setting: Setting) -> list[dict[str, Any]]:
+def rows_of(given: argparse.Namespace, setting: EvaluationConfig) -> list[dict[str, Any]]:
     """The reproduction, with progress shown and each row saved."""
     with progress("reproduce") as report:
         return reproduce(setting, progress=report, path=given.out / "reproduction.json")

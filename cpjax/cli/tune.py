@@ -20,14 +20,14 @@ from cpjax.paper.initial import initial_controller
 from cpjax.plant import CartPole
 from cpjax.plant.initial_states import START_SETS
 from cpjax.tune.baseline import GateKind
+from cpjax.tune.config import AGGREGATES, TuningConfig
 from cpjax.tune.objective import Goal
 from cpjax.tune.parameters import FreeParameters, free_parameters
-from cpjax.tune.plan import AGGREGATES, Plan
 
 if TYPE_CHECKING:  # with optax, which takes a while
     from cpjax.tune.outcome import Tuning
 
-_DEFAULTS = {field.name: field.default for field in dataclasses.fields(Plan)}
+_DEFAULTS = {field.name: field.default for field in dataclasses.fields(TuningConfig)}
 _PLANNED = {
     "candidates": "random controllers to choose restarts from",
     "restarts": "controllers that are tuned side by side",
@@ -97,7 +97,7 @@ def run(given: argparse.Namespace) -> int:
     announce("tune", notes)
     names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}
     free = free_parameters(controller, **names, full_q=setting.pop("full_q", "diagonal") == "full")
-    plan = Plan(seed=given.seed, goal=Goal(**sections["goal"]), **setting)
+    plan = TuningConfig(seed=given.seed, goal=Goal(**sections["goal"]), **setting)
     tuning = tuned(given.out, plant, free, plan, given.out / "checkpoint.npz", notes)
     before = np.asarray(free.physical(free.start()))
     rows = [(label, f"{a:.4g}", f"{b:.4g}") for label, a, b in zip(tuning.labels, before, tuning.physical, strict=True)]
@@ -112,7 +112,7 @@ def run(given: argparse.Namespace) -> int:
 
 
 def tuned(
-    out: Path, plant: CartPole, free: FreeParameters, plan: Plan, checkpoint: Path, notes: Sequence[str] = ()
+    out: Path, plant: CartPole, free: FreeParameters, plan: TuningConfig, checkpoint: Path, notes: Sequence[str] = ()
 ) -> "Tuning":
     """The tuning, with tuned.json, tune.json and tune.png written."""
     from cpjax.tune.outcome import document

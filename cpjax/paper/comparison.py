@@ -9,7 +9,7 @@ import numpy as np
 from cpjax import io, paper
 from cpjax.controllers import Hybrid
 from cpjax.controllers.hybrid import without_design
-from cpjax.paper.reproduction import DESIGNS, GAINS, Setting
+from cpjax.paper.reproduction import DESIGNS, GAINS, EvaluationConfig
 from cpjax.plant import CartPole
 from cpjax.plant.initial_states import sample_starts
 from cpjax.plant.state import State
@@ -65,7 +65,7 @@ def entries(plant: CartPole, tuned: Mapping[paper.Design, Hybrid] | None = None)
 def compare(
     plant: CartPole,
     chosen: Sequence[Entry],
-    setting: Setting,
+    setting: EvaluationConfig,
     *,
     track_limit: float = float("inf"),
     progress: Report | None = None,
@@ -91,7 +91,7 @@ def compare(
     return starts, results
 
 
-def document(plant: CartPole, results: Sequence[Compared], setting: Setting, **others: Any) -> dict[str, Any]:
+def document(plant: CartPole, results: Sequence[Compared], setting: EvaluationConfig, **others: Any) -> dict[str, Any]:
     """The comparison for programs."""
     rows = [
         {

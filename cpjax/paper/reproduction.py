@@ -35,7 +35,7 @@ class Variant:
 
 
 @dataclasses.dataclass(frozen=True)
-class Setting:
+class EvaluationConfig:
     """How the protocol's evaluation runs are made: RK4, the sampled clock with one control instant a step.
 
     Raises:
@@ -58,7 +58,7 @@ def variants() -> list[Variant]:
     return [Variant(*choice) for choice in itertools.product(paper.LAWS, paper.PLANTS, DESIGNS, GAINS)]
 
 
-def evaluate(variant: Variant, setting: Setting, starts: State | None = None) -> Metrics:
+def evaluate(variant: Variant, setting: EvaluationConfig, starts: State | None = None) -> Metrics:
     """Metrics of one variant over the setting's starts."""
     plant = paper.PLANTS[variant.plant]()
     controller = without_design(paper.controller(variant.law, variant.design, plant, variant.gains))
@@ -71,7 +71,7 @@ def evaluate(variant: Variant, setting: Setting, starts: State | None = None) ->
 
 
 def reproduce(
-    setting: Setting, *, progress: Callable[[int, int, str], None] | None = None, path: Path | None = None
+    setting: EvaluationConfig, *, progress: Callable[[int, int, str], None] | None = None, path: Path | None = None
 ) -> list[dict[str, Any]]:
     """One row per variant: the variant's names beside what `summarise` says of its metrics.
 
@@ -97,7 +97,7 @@ def reproduce(
     return rows
 
 
-def representative(law: str, plant: str, setting: Setting) -> tuple[str, State]:
+def representative(law: str, plant: str, setting: EvaluationConfig) -> tuple[str, State]:
     """A start to show a law with both regulators by, with what it is in words.
 
     Exactly hanging at rest, for a law that starts from there. For one that does not, of the starts that both catch with
@@ -115,14 +115,14 @@ def representative(law: str, plant: str, setting: Setting) -> tuple[str, State]:
     return f"{words} of {setting.count} {setting.starts} starts (number {index + 1})", start
 
 
-def trajectory(law: str, design: paper.Design, plant: str, start: State, setting: Setting) -> Trajectory:
+def trajectory(law: str, design: paper.Design, plant: str, start: State, setting: EvaluationConfig) -> Trajectory:
     """One rollout with the printed gains, under the protocol."""
     model = paper.PLANTS[plant]()
     controller = paper.controller(law, design, model)
     return rollout(model, controller, start, duration=setting.duration, dt=setting.dt, clock="sampled")
 
 
-def _document(setting: Setting, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def _document(setting: EvaluationConfig, rows: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "what": "the paper's controllers over a seeded set of starts",
         "versions": io.versions(),
@@ -132,7 +132,7 @@ def _document(setting: Setting, rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _resume(path: Path, setting: Setting) -> list[dict[str, Any]]:
+def _resume(path: Path, setting: EvaluationConfig) -> list[dict[str, Any]]:
     """Rows of an interrupted run with the same setting and versions."""
     if not path.exists():
         return []
@@ -148,3 +148,7 @@ def _resume(path: Path, setting: Setting) -> list[dict[str, Any]]:
     expected_names = [dataclasses.asdict(variant) for variant in variants()[: len(rows)]]
     found = [{key: dict(row).get(key) for key in names} for row, names in zip(rows, expected_names, strict=True)]
     return rows if found == expected_names else []
+
+
+Setting = EvaluationConfig
+"""The name until version 0.1."""

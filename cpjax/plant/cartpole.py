@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from cpjax.backend.trigonometry import LARGEST_TURN, sin_cos, turned
+from cpjax.backend.trigonometry import LARGEST_TURN, rotate_by, sin_cos
 from cpjax.checks import call, real
 from cpjax.plant.motor import Motor
 from cpjax.plant.state import ANGLE_LIMIT, NAMES, RUNAWAY_LIMIT, UNITS, State
@@ -125,7 +125,7 @@ class CartPole:
         """Returns sine and cosine after a `change` of the positions, and whether that is accurate to rounding."""
         turn = jnp.asarray(change[1])
         accurate = jnp.abs(turn) <= LARGEST_TURN
-        return turned(jnp.asarray(geometry[0]), jnp.asarray(geometry[1]), turn), accurate
+        return rotate_by(jnp.asarray(geometry[0]), jnp.asarray(geometry[1]), turn), accurate
 
     def accelerations(self, geometry: Pair, v: Pair, u: Scalar) -> Pair:
         """Returns (x'', theta'') [m/s^2, rad/s^2] under the applied voltage `u` [V].

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 
-from cpjax.backend.extremes import larger, smaller
+from cpjax.backend.extremes import fast_maximum, fast_minimum
 from cpjax.pytree import Scalar, number, pytree
 
 
@@ -54,7 +54,7 @@ class Motor:
 
     def saturate(self, voltage: Scalar) -> jax.Array:
         """The demanded voltage [V] clipped to the supply. Derivative 1 inside, 0 outside, 1/2 exactly on the limit."""
-        return larger(-self.voltage_limit, smaller(self.voltage_limit, voltage))
+        return fast_maximum(-self.voltage_limit, fast_minimum(self.voltage_limit, voltage))
 
     def current(self, voltage: Scalar, x_dot: Scalar) -> Scalar:
         """Current in the winding [A] at an applied voltage [V] and cart velocity [m/s]."""

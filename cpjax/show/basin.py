@@ -16,7 +16,7 @@ from cpjax.errors import InputError
 from cpjax.plant.state import NAMES, State
 from cpjax.show.figures import GATE_COLOUR, as_text
 from cpjax.sim.metrics import Metrics
-from cpjax.study.basin import Area, Map
+from cpjax.study.basin import Area, StartGrid
 from cpjax.study.design_check import DesignCheck
 
 LABELS = {
@@ -43,7 +43,7 @@ class Panel(NamedTuple):
     area: Area
 
 
-def basins(chart: Map, panels: Sequence[Panel]) -> Figure:
+def basins(chart: StartGrid, panels: Sequence[Panel]) -> Figure:
     """Settling time and number of mode changes of every cell, a column for each controller, failures grey.
 
     Orange: the gate. Black: beyond, the regulator asks for more than the supply gives. Pink: the level set that the
@@ -100,12 +100,12 @@ def _longest(metrics: Metrics) -> float:
     return float(np.quantile(times, 0.99)) if times.size else 1.0
 
 
-def _range(chart: Map, name: str) -> str:
+def _range(chart: StartGrid, name: str) -> str:
     low, high = chart.others.get(name, (0.0, 0.0))
     return f"{name} = {low:g}" if low == high else f"{name} from {low:g} to {high:g}"
 
 
-def _lines(axes: Axes, chart: Map, panel: Panel) -> None:
+def _lines(axes: Axes, chart: StartGrid, panel: Panel) -> None:
     across = np.linspace(chart.across.low, chart.across.high, _FINE)
     up = np.linspace(chart.up.low, chart.up.high, _FINE)
     grid = dict(zip((chart.across.name, chart.up.name), np.meshgrid(across, up), strict=True))

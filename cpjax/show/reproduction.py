@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from cpjax import paper
 from cpjax.numeric.statistics import two_proportion_p_value
-from cpjax.paper.reproduction import Setting, representative, trajectory
+from cpjax.paper.reproduction import EvaluationConfig, representative, trajectory
 from cpjax.show.figures import DESIGN_NAMES, SIDE_BY_SIDE, paper_figures
 
 SHOWN = (("as-printed", "appendix", 10.0), ("corrected-centred", "appendix", 10.0))
@@ -54,7 +54,7 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def pictures(setting: Setting) -> list[tuple[str, Figure, str]]:
+def pictures(setting: EvaluationConfig) -> list[tuple[str, Figure, str]]:
     """Our Figures 3 to 6: for each law of `SHOWN` a file name, the figure, and its caption."""
     results = []
     for law, plant, until in SHOWN:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from cpjax.backend.single_kernel import part_of_step
+from cpjax.backend.single_kernel import outline
 from cpjax.checks import call, integer, real
 from cpjax.controllers.protocol import SmoothController, demand
 from cpjax.errors import InputError
@@ -123,7 +123,7 @@ System: TypeAlias = ContinuousLoop | HeldLoop
 def plant_accelerations(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Tree:
     """Returns q''."""
     geometry = plants.geometry(plant, q)
-    return part_of_step(plants.accelerations)(plant, geometry, v, u, mode)
+    return outline(plants.accelerations)(plant, geometry, v, u, mode)
 
 
 def plant_guards(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Guards:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cpjax.backend.single_kernel import part_of_step
+from cpjax.backend.single_kernel import outline
 from cpjax.pytree import Scalar
 from cpjax.sim import plants
 from cpjax.sim.flags import STOPPED, Flag
@@ -48,7 +48,7 @@ def safe(going: jax.Array, tree: Any) -> Any:
 
 def verdict(plant: Plant, after: Tree, outlook: Outlook) -> tuple[jax.Array, jax.Array]:
     """Returns whether the state after a step is within the limits, and the flag for a step that is not."""
-    within, finite = part_of_step(_judged)(after, outlook.ahead, plant.limits)
+    within, finite = outline(_judged)(after, outlook.ahead, plant.limits)
     return within, jnp.where(finite, np.int32(Flag.RUNAWAY), np.int32(Flag.NON_FINITE))
 
 

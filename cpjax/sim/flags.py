@@ -33,8 +33,8 @@ STOPPED = int(Flag.RUNAWAY | Flag.NON_FINITE | Flag.OVERFLOW)
 
 CHATTER_LENGTH = 8
 
-IN_DOUBT = 1 << 30
-"""Beside the flags, for `sweep` alone, which then computes the start again: see `Settings.optimistic`."""
+NEEDS_RECOMPUTE = 1 << 30
+"""Beside the flags, for `sweep` alone, which then computes the start again: see `Settings.fast_path`."""
 
 
 def describe(flag: int) -> str:
@@ -43,7 +43,7 @@ def describe(flag: int) -> str:
     return ", ".join(names) or "clean"
 
 
-def unknown(tree: Any) -> jax.Array:
+def nonfinite_flag(tree: Any) -> jax.Array:
     """Returns NON_FINITE if a number of the tree is NaN, else 0; int32."""
     leaves = jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(tree) if is_number(leaf)])
     return jnp.where(jnp.any(leaves), int(Flag.NON_FINITE), 0).astype(jnp.int32)

@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cpjax.backend.single_kernel import one_function, part_of_step
+from cpjax.backend.single_kernel import outline, single_kernel
 from cpjax.checks import call
 from cpjax.errors import InputError
 from cpjax.sim import failures, plants
 from cpjax.sim.closed_loop import GATE_CROSSING, ContinuousLoop, HeldLoop, HeldMode, System
 from cpjax.sim.control import Control, start_control, update_control
-from cpjax.sim.flags import CHATTER_LENGTH, Flag, unknown
+from cpjax.sim.flags import CHATTER_LENGTH, Flag, nonfinite_flag
 from cpjax.sim.integrators import INTEGRATORS, Integrator
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.per_step import sees_the_voltage, start_metric, update_metric
@@ -50,7 +50,7 @@ def simulate(
 ) -> tuple[jax.Array | None, Sample, Any]:
     """Simulates one start; see `cpjax.sim.rollout.simulate`."""
     q, v = plants.coordinates(plant, start)
-    flag = unknown((start, plant, controller))
+    flag = nonfinite_flag((start, plant, controller))
     system: System
     mode: Any
     control = None
@@ -70,7 +70,7 @@ def simulate(
         allowed = "pathwise, for a plant with events and a metric that depends on the voltage"
         raise InputError("derivative", "mean", allowed)
 
-    run = one_function(functools.partial(_run, settings=settings), stacks=True)
+    run = single_kernel(functools.partial(_run, settings=settings), stacks=True)
     carry = (loop, update_metric(fold, started, first))
     carry, kept = run(carry, plant, controller, fold, dt)
     loop, memory = carry
@@ -98,7 +98,7 @@ def _run(
         before, memory = carry
         loop, reached = _advance(plant, controller, before, dt, settings, iterations - index)
         sample = _sample(plant, loop, before.motion, dt)
-        after = part_of_step(update_metric)(fold, memory, sample)
+        after = outline(update_metric)(fold, memory, sample)
         updated = after, sample.voltage, sample.mode
         kept = memory, loop.voltage, loop.mode
         memory, voltage, mode = jax.tree.map(lambda new, old: jnp.where(reached, new, old), updated, kept)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cpjax.backend.extremes import larger, smaller
+from cpjax.backend.extremes import fast_maximum, fast_minimum
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.numeric.angles import wrap_angle
 from cpjax.pytree import Scalar, number, pytree
@@ -194,12 +194,12 @@ class ProtocolMetrics:
             variation = variation + jnp.abs(last - first)
             effort = 0.5 * (effort + sample.elapsed * last * last)
         return _Memory(
-            entered=jnp.where(inside, smaller(sample.time, memory.entered), math.inf),
-            cart_travel=larger(memory.cart_travel, travel),
+            entered=jnp.where(inside, fast_minimum(sample.time, memory.entered), math.inf),
+            cart_travel=fast_maximum(memory.cart_travel, travel),
             effort=memory.effort + effort,
             voltage_variation=memory.voltage_variation + variation,
-            peak_voltage=larger(memory.peak_voltage, jnp.abs(sample.voltage)),
-            peak_cart_acceleration=larger(memory.peak_cart_acceleration, jnp.abs(sample.cart_acceleration)),
+            peak_voltage=fast_maximum(memory.peak_voltage, jnp.abs(sample.voltage)),
+            peak_cart_acceleration=fast_maximum(memory.peak_cart_acceleration, jnp.abs(sample.cart_acceleration)),
             switches=memory.switches + (sample.mode != sample.mode_before).astype(memory.switches.dtype),
         )
 

@@ -14,13 +14,13 @@ import numpy as np
 from jax.extend.core import Literal
 
 from cpjax.backend import runtime
-from cpjax.backend.single_kernel import one_function, part_of_step
+from cpjax.backend.single_kernel import outline, single_kernel
 from cpjax.checks import call, like
 from cpjax.pytree import cast
 from cpjax.sim import failures, plants
 from cpjax.sim.control import Control, start_control, update_control
 from cpjax.sim.derivatives import shifted
-from cpjax.sim.flags import CHATTER_LENGTH, IN_DOUBT, Flag, unknown
+from cpjax.sim.flags import CHATTER_LENGTH, NEEDS_RECOMPUTE, Flag, nonfinite_flag
 from cpjax.sim.integrators import INTEGRATORS
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.plants import Plant, Tree
@@ -52,16 +52,16 @@ def simulate(
 ) -> tuple[jax.Array | None, Sample, Any]:
     """Simulates one start; see `cpjax.sim.rollout.simulate`."""
     control = start_control(plant, controller, start, settings)
-    flag = unknown((start, plant, controller))
-    flag = jnp.where(flag != 0, np.int32(IN_DOUBT), flag) if settings.optimistic else flag
+    flag = nonfinite_flag((start, plant, controller))
+    flag = jnp.where(flag != 0, np.int32(NEEDS_RECOMPUTE), flag) if settings.fast_path else flag
     loop = _Loop(start, control, flag, jnp.zeros_like(flag))
     _, first, _ = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
 
     carry = (loop, start_metric(fold, first))
-    run = one_function(functools.partial(_run, settings=settings), stacks=True)
+    run = single_kernel(functools.partial(_run, settings=settings), stacks=True)
     (loop, memory), samples = run(carry, plant, controller, fold, dt)
     after, last, _ = _observe(plant, controller, loop, jnp.asarray(settings.steps), dt, settings)
-    clean = last._replace(flag=last.flag & ~IN_DOUBT)
+    clean = last._replace(flag=last.flag & ~NEEDS_RECOMPUTE)
     memory = _fold(
         fold, memory, clean, plant, loop.control, after.control, jnp.asarray(settings.steps), settings, update_metric
     )
@@ -78,7 +78,7 @@ def _run(
         before, memory = carry
         loop, sample, instant = _observe(plant, controller, before, index, dt, settings)
         memory = _fold(
-            fold, memory, sample, plant, before.control, loop.control, index, settings, part_of_step(update_metric)
+            fold, memory, sample, plant, before.control, loop.control, index, settings, outline(update_metric)
         )
         saved = pack(_saved(plant, sample, loop)) if every == 1 else None
         return (_advance(plant, controller, loop, instant, dt, settings), memory), saved
@@ -90,7 +90,7 @@ def _run(
 
     if every is None:
         # With these options of the compiler, all that is remembered would be copied at each step.
-        checkpoint = "segments" if runtime.fast_loops() else settings.checkpoint
+        checkpoint = "segments" if runtime.compiler_fuses_loops() else settings.checkpoint
         return scan(body, carry, jnp.arange(steps), checkpoint)
     if every == 1:
         return scan(body, carry, jnp.arange(steps), "every_step")
@@ -182,10 +182,10 @@ def _observe(
     voltage, mode = control.voltage, control.mode
     flag = loop.flag | jnp.where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
     # Optimistic, no run is stopped: one that should be is in doubt.
-    going = jnp.asarray(True) if settings.optimistic else ~failures.is_stopped(flag)
+    going = jnp.asarray(True) if settings.fast_path else ~failures.is_stopped(flag)
     q, v = plants.coordinates(plant, state)
     geometry = plants.geometry(plant, q)
-    accelerations = part_of_step(plants.accelerations)(plant, geometry, v, voltage)
+    accelerations = outline(plants.accelerations)(plant, geometry, v, voltage)
     sample = Sample(
         time=index.astype(dt.dtype) * dt,
         elapsed=jnp.where((index > 0) & going, dt, 0.0),
@@ -202,7 +202,7 @@ def _observe(
         crossing_speed=jnp.zeros_like(voltage),
     )
     if control.blend is not None:
-        accelerations = part_of_step(plants.accelerations)(plant, geometry, v, control.applied)
+        accelerations = outline(plants.accelerations)(plant, geometry, v, control.applied)
     return _Loop(state, control, flag, changes), sample, _Instant(accelerations, geometry)
 
 
@@ -211,10 +211,10 @@ def _advance(plant: Plant, controller: Any, loop: _Loop, instant: _Instant, dt: 
     state, method = loop.state, INTEGRATORS[settings.integrator]
     first, geometry = instant
     outlook = failures.look_ahead(plant, plants.coordinates(plant, state)[1], first, dt)
-    if settings.optimistic:  # values only, so nothing has to be safe, and what went wrong is computed again
+    if settings.fast_path:  # values only, so nothing has to be safe, and what went wrong is computed again
         after, near = step_held_incremental(plant, method, state, geometry, loop.control.voltage, dt, first)
         right = outlook.possible & near & plants.within(after, plant.limits)
-        return loop._replace(state=after, flag=loop.flag | jnp.where(right, np.int32(0), np.int32(IN_DOUBT)))
+        return loop._replace(state=after, flag=loop.flag | jnp.where(right, np.int32(0), np.int32(NEEDS_RECOMPUTE)))
     stopped = failures.is_stopped(loop.flag)
     going = ~stopped & outlook.possible
     safe, safe_first, safe_voltage = failures.safe(going, (state, first, loop.control.applied))

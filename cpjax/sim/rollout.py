@@ -26,11 +26,11 @@ from cpjax.plant import CartPole
 from cpjax.pytree import as_arguments, check, pytree, reveal
 from cpjax.sim import located, per_step
 from cpjax.sim.derivatives import may_switch, watched
-from cpjax.sim.flags import IN_DOUBT
+from cpjax.sim.flags import NEEDS_RECOMPUTE
 from cpjax.sim.initial import checked_initial
 from cpjax.sim.metrics import Fold, NoMetrics, ProtocolMetrics, Sample
 from cpjax.sim.plants import Plant, Tree, check_plant, has_events
-from cpjax.sim.saved import Kept, fields, keep
+from cpjax.sim.saved import SavedSamples, fields, keep
 from cpjax.sim.settings import Settings, Simulation, check_names, check_settings
 
 
@@ -169,7 +169,7 @@ def _simulate(start: Tree, plant: Plant, controller: Any, fold: Fold, dt: jax.Ar
 
 def simulate(
     start: Tree, plant: Any, controller: Any, fold: Any, dt: jax.Array, settings: Settings
-) -> tuple[Kept | None, Sample, Any]:
+) -> tuple[SavedSamples | None, Sample, Any]:
     """Simulates one initial state; arguments as `prepared` returns them.
 
     Returns:
@@ -187,11 +187,11 @@ def simulate(
     return (None if packed is None else keep(packed, plant, last)), last, result
 
 
-def results(kept: Kept | None, last: Sample, result: Any) -> Any:
+def results(kept: SavedSamples | None, last: Sample, result: Any) -> Any:
     """Returns what users get of what `simulate` returned: a `Trajectory`, or only the metric's result."""
     if kept is None:
         return result
-    return Trajectory(**fields(kept, last), flag=last.flag & ~IN_DOUBT, metrics=result)
+    return Trajectory(**fields(kept, last), flag=last.flag & ~NEEDS_RECOMPUTE, metrics=result)
 
 
 def _without_designs(controller: Any) -> Any:

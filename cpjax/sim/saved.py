@@ -15,7 +15,7 @@ from cpjax.sim.metrics import Sample
 from cpjax.sim.plants import Plant
 
 
-class Kept(NamedTuple):
+class SavedSamples(NamedTuple):
     """Of every row but the last one."""
 
     packed: jax.Array
@@ -29,7 +29,7 @@ def pack(sample: Sample) -> jax.Array:
     return jnp.stack([field.astype(sample.time.dtype) for field in jax.tree.leaves(_packed_fields(sample))])
 
 
-def keep(packed: jax.Array, plant: Plant, last: Sample) -> Kept:
+def keep(packed: jax.Array, plant: Plant, last: Sample) -> SavedSamples:
     """Returns rows of shape (rows, columns), completed; `last` is a sample of the same run."""
     fields = _unpacked([packed[:, i] for i in range(packed.shape[1])], last)
 
@@ -38,10 +38,10 @@ def keep(packed: jax.Array, plant: Plant, last: Sample) -> Kept:
         acceleration = plants.accelerations(plant, plants.geometry(plant, q), v, fields.voltage, fields.plant_mode)
         return plants.outputs(plant, fields.state, acceleration, fields.voltage)
 
-    return Kept(packed, jax.vmap(row)(fields))
+    return SavedSamples(packed, jax.vmap(row)(fields))
 
 
-def fields(kept: Kept, last: Sample) -> dict[str, Any]:
+def fields(kept: SavedSamples, last: Sample) -> dict[str, Any]:
     """Returns the fields of a `Trajectory`, of shape (..., rows + 1), of all rows (row first) and the last sample."""
 
     def joined(many: jax.Array, one: jax.Array) -> jax.Array:

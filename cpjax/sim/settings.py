@@ -67,9 +67,9 @@ class Settings(NamedTuple):
     integrator: str
     checkpoint: Checkpoint
     derivative: Derivative | None
-    optimistic: bool = False
+    fast_path: bool = False
     """Values only: held steps by `step_held_incremental`, and no run is held where it goes wrong. A start for which
-    that was not right has the flag `IN_DOUBT`, and all else about it means nothing."""
+    that was not right has the flag `NEEDS_RECOMPUTE`, and all else about it means nothing."""
 
 
 def check_names(function: str, simulation: Any) -> None:

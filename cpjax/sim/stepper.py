@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from cpjax.backend.single_kernel import part_of_step
+from cpjax.backend.single_kernel import outline
 from cpjax.controllers.protocol import ModalController, demand
 from cpjax.pytree import Scalar
 from cpjax.sim import plants
@@ -15,7 +15,7 @@ from cpjax.sim.plants import Plant, Tree
 
 def applied_voltage(plant: Plant, controller: ModalController, state: Tree, mode: jax.Array) -> jax.Array:
     """Returns what the plant gets: the law's demand in `mode`, in the state's dtype, clipped by the drive."""
-    return plants.saturate(plant, part_of_step(demand)(controller, state, mode))
+    return plants.saturate(plant, outline(demand)(controller, state, mode))
 
 
 def dtype_of(tree: Tree) -> Any:
@@ -38,7 +38,7 @@ def step_held(
     """
 
     def acceleration(q: Tree, v: Tree) -> Tree:
-        return part_of_step(plants.accelerations)(plant, plants.geometry(plant, q), v, u)
+        return outline(plants.accelerations)(plant, plants.geometry(plant, q), v, u)
 
     q, v = integrator(acceleration, *plants.coordinates(plant, state), dt, first)
     return plants.state_of(plant, q, v)
@@ -67,7 +67,7 @@ def step_held_incremental(
         change = jax.tree.map(jnp.subtract, q, start)
         there, near = plants.geometry_near(plant, geometry, q, change)
         accurate &= near
-        return part_of_step(plants.accelerations)(plant, there, v, u)
+        return outline(plants.accelerations)(plant, there, v, u)
 
     q, v = integrator(acceleration, start, velocities, dt, first)
     return plants.state_of(plant, q, v), accurate
@@ -90,7 +90,7 @@ def step_continuous(
 
     def acceleration(q: Tree, v: Tree) -> Tree:
         u = applied_voltage(plant, controller, plants.state_of(plant, q, v), mode)
-        return part_of_step(plants.accelerations)(plant, plants.geometry(plant, q), v, u)
+        return outline(plants.accelerations)(plant, plants.geometry(plant, q), v, u)
 
     q, v = integrator(acceleration, *plants.coordinates(plant, state), dt, first)
     return plants.state_of(plant, q, v)

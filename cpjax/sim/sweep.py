@@ -21,12 +21,12 @@ from cpjax.backend import runtime
 from cpjax.controllers.protocol import Controller, Law, ModalController
 from cpjax.errors import InputError
 from cpjax.pytree import is_traced
-from cpjax.sim.flags import IN_DOUBT
+from cpjax.sim.flags import NEEDS_RECOMPUTE
 from cpjax.sim.initial import component_names
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.rollout import prepared, results, simulate
-from cpjax.sim.saved import Kept
+from cpjax.sim.saved import SavedSamples
 from cpjax.sim.settings import Settings, Simulation, check_names
 
 Progress = Callable[[int, int], None]
@@ -90,10 +90,10 @@ def sweep(
     work = prepare(plant, controller, starts, metrics=metrics, chunk=chunk, block=block, **simulation)
     if work.traced:
         columns, shared = _split(work.leaves, work.kind.batched)
-        kind = work.kind._replace(settings=work.kind.settings._replace(optimistic=False))
+        kind = work.kind._replace(settings=work.kind.settings._replace(fast_path=False))
         return jax.vmap(lambda column: results(*_one(column, shared, kind)))(columns)
     whole: Any = None
-    for begin, part in zip(work.begins(), work.blocks(work.begins()), strict=True):
+    for begin, part in zip(work.block_offsets(), work.blocks(work.block_offsets()), strict=True):
         if whole is None:
             whole = jax.tree.map(lambda array: _unwritten((work.total, *array.shape[1:]), array.dtype), part)
         for array, rows in zip(jax.tree.leaves(whole), jax.tree.leaves(part), strict=True):
@@ -103,7 +103,7 @@ def sweep(
     return jax.tree.map(lambda array: jax.device_put(array, may_alias=True), whole)  # nobody else has it
 
 
-class _Kind(NamedTuple):
+class _CompileKey(NamedTuple):
     """What a compilation depends on, beside shapes and dtypes."""
 
     structure: Any
@@ -115,10 +115,10 @@ class _Kind(NamedTuple):
     mesh: Mesh
 
 
-class Work(NamedTuple):
+class SweepPlan(NamedTuple):
     """A sweep, ready to be done a block at a time."""
 
-    kind: _Kind
+    kind: _CompileKey
     leaves: list[Any]
     total: int
     size: int
@@ -135,17 +135,17 @@ class Work(NamedTuple):
         """Whether JAX is tracing any of the numbers that go in."""
         return any(is_traced(leaf) for leaf in self.leaves)
 
-    def begins(self) -> range:
+    def block_offsets(self) -> range:
         """Where the blocks begin."""
         return range(0, self.total, self.size)
 
-    def blocks(self, begins: Iterable[int]) -> Iterator[Any]:
-        """The results of up to `size` starts from each of `begins` on, as NumPy arrays.
+    def blocks(self, block_offsets: Iterable[int]) -> Iterator[Any]:
+        """The results of up to `size` starts from each of `block_offsets` on, as NumPy arrays.
 
         While the caller has one, the devices work on the next.
         """
         waiting: tuple[int, Any] | None = None
-        for begin in begins:
+        for begin in block_offsets:
             members = np.minimum(np.arange(begin, begin + self.size), self.total - 1)
             ahead = (begin, self._compute(members, self.kind))
             if waiting is not None:
@@ -160,7 +160,7 @@ class Work(NamedTuple):
         first = [column[0] for column in columns]
         return jax.tree.structure(jax.eval_shape(lambda: results(*_one(first, shared, self.kind))))
 
-    def _compute(self, members: np.ndarray, kind: _Kind) -> Any:
+    def _compute(self, members: np.ndarray, kind: _CompileKey) -> Any:
         """Results and flags of these starts, still being computed."""
         columns, shared = _split(self.leaves, kind.batched)
         placed = [_place(np.asarray(column)[members], NamedSharding(kind.mesh, _SHARED_OUT)) for column in columns]
@@ -176,10 +176,10 @@ class Work(NamedTuple):
 
     def _collect(self, begin: int, results: Any) -> Any:
         result, flag = jax.tree.map(lambda array: _gather(array)[: self.total - begin], results)
-        doubtful = np.flatnonzero(flag & IN_DOUBT)
+        doubtful = np.flatnonzero(flag & NEEDS_RECOMPUTE)
         if doubtful.size:
             result = jax.tree.map(np.array, result)  # may be written to
-            kind = self.kind._replace(settings=self.kind.settings._replace(optimistic=False))
+            kind = self.kind._replace(settings=self.kind.settings._replace(fast_path=False))
             together = kind.chunk * kind.mesh.size
             for first in range(0, doubtful.size, together):
                 rows = doubtful[first : first + together]
@@ -199,21 +199,21 @@ def prepare(
     chunk: int | None,
     block: int | None,
     **simulation: Any,
-) -> Work:
+) -> SweepPlan:
     """Checks a sweep's arguments and divides its initial states into blocks; arguments and errors of `sweep`."""
     for name, value in (("chunk", chunk), ("block", block)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
             raise InputError(name, value, "a whole number of starts, at least 1")
     starts, arguments, settings, batched = prepared(plant, controller, starts, metrics, batched=True, **simulation)
-    settings = settings._replace(optimistic=settings.clock == "sampled" and settings.switching == "per_step")
+    settings = settings._replace(fast_path=settings.clock == "sampled" and settings.switching == "per_step")
     leaves, structure = jax.tree.flatten((starts, arguments))
     columns = jax.tree.leaves(starts)
     total, dtype = columns[0].shape[0], columns[0].dtype
     devices = jax.devices()
     lanes, size = _sizes(total, devices, settings, np.dtype(dtype).itemsize, chunk, block)
     mesh = Mesh(np.array(devices), (_AXIS,))
-    kind = _Kind(structure, (True,) * len(columns) + tuple(batched), settings, lanes, mesh)
-    return Work(kind, leaves, total, size)
+    kind = _CompileKey(structure, (True,) * len(columns) + tuple(batched), settings, lanes, mesh)
+    return SweepPlan(kind, leaves, total, size)
 
 
 def _sizes(
@@ -241,7 +241,7 @@ def _split(leaves: list[Any], batched: tuple[bool, ...]) -> tuple[list[Any], lis
     return columns, [leaf for leaf, many in zip(leaves, batched, strict=True) if not many]
 
 
-def _one(column: list[Any], shared: list[Any], kind: _Kind) -> tuple[Kept | None, Sample, Any]:
+def _one(column: list[Any], shared: list[Any], kind: _CompileKey) -> tuple[SavedSamples | None, Sample, Any]:
     """What `simulate` returns, of one start."""
     columns, others = iter(column), iter(shared)
     leaves = [next(columns) if many else next(others) for many in kind.batched]
@@ -253,7 +253,7 @@ _Forms: TypeAlias = tuple[tuple[tuple[int, ...], str], ...]
 """Shape and dtype of each leaf that all starts share."""
 
 
-def _block(columns: list[jax.Array], packed: dict[str, jax.Array], kind: _Kind, forms: _Forms) -> Any:
+def _block(columns: list[jax.Array], packed: dict[str, jax.Array], kind: _CompileKey, forms: _Forms) -> Any:
     def share(columns: list[jax.Array], packed: dict[str, jax.Array]) -> Any:
         shared = _unpacked(packed, forms)
 

@@ -58,7 +58,7 @@ class Axis:
 
 
 @dataclasses.dataclass(frozen=True)
-class Map:
+class StartGrid:
     """Which starts a basin is sampled from: one in each cell, anywhere in it.
 
     Attributes:
@@ -137,7 +137,7 @@ class Area:
     share: float
 
 
-def area(chart: Map, success: np.ndarray[Any, Any]) -> Area:
+def area(chart: StartGrid, success: np.ndarray[Any, Any]) -> Area:
     """The basin's area, from the successes of the chart's starts (rows * columns,).
 
     One random start in each cell is a stratified sample. Its mean is unbiased, and its variance is that within the
@@ -157,7 +157,7 @@ def area(chart: Map, success: np.ndarray[Any, Any]) -> Area:
     return Area(share * whole, half_width * whole, share)
 
 
-def document(chart: Map, metrics: Metrics) -> dict[str, Any]:
+def document(chart: StartGrid, metrics: Metrics) -> dict[str, Any]:
     """A basin in a few numbers, for JSON."""
     good = np.asarray(metrics.success)
     times, switches = np.asarray(metrics.settling_time)[good], np.asarray(metrics.switches)[good]
@@ -172,3 +172,7 @@ def document(chart: Map, metrics: Metrics) -> dict[str, Any]:
         "switches_mean": float(np.mean(switches)) if times.size else None,
         "switches_max": int(np.max(switches)) if times.size else None,
     }
+
+
+Map = StartGrid
+"""The name until version 0.1."""

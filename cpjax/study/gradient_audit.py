@@ -28,8 +28,8 @@ from cpjax.sim.initial import checked_initial
 from cpjax.sim.metrics import Fold, TimeOutside
 from cpjax.sim.rollout import measure
 from cpjax.sim.settings import check_settings
-from cpjax.study.gradient_probe import Probe, Prober
-from cpjax.study.named_parameters import Build, Numbers, as_matrix, as_tree, whole_changes
+from cpjax.study.gradient_probe import HorizonRecorder, Probe
+from cpjax.study.named_parameters import Build, Numbers, as_matrix, as_tree, parameter_scales
 
 Report: TypeAlias = Callable[[int, int, str], None]
 
@@ -193,8 +193,8 @@ def audit_gradients(
             raise InputError("temperatures", temperature, "finite numbers above 0")
     n = int(jnp.shape(starts.x)[0])
     names, x, shapes = as_matrix(parameters, n, each)
-    scale = whole_changes(names, x, scales or {})
-    fold = Prober(
+    scale = parameter_scales(names, x, scales or {})
+    fold = HorizonRecorder(
         TimeOutside() if objective is None else objective, jnp.asarray(ends + 0.25 * dt, dtype), jnp.asarray(dt, dtype)
     )
 

@@ -32,7 +32,7 @@ class _Memory(NamedTuple):
 
 
 @pytree
-class Prober:
+class HorizonRecorder:
     """The fold that keeps an objective and what led to it at several horizons."""
 
     objective: Fold = part("a fold", "init", "update", "finish")

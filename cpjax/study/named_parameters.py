@@ -111,7 +111,7 @@ def as_tree(vector: jax.Array, shapes: Any) -> dict[str, jax.Array]:
     return tree
 
 
-def whole_changes(names: tuple[str, ...], x: Numbers, given: Mapping[str, float]) -> Numbers:
+def parameter_scales(names: tuple[str, ...], x: Numbers, given: Mapping[str, float]) -> Numbers:
     """What counts as a whole change of each element (n, d): what is given, or else its size.
 
     Raises:

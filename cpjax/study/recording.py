@@ -19,7 +19,7 @@ from cpjax.sim.metrics import Fold
 from cpjax.sim.plants import Plant
 from cpjax.sim.rollout import default_metrics
 from cpjax.sim.settings import Simulation, check_names
-from cpjax.sim.sweep import Progress, Work, prepare
+from cpjax.sim.sweep import Progress, SweepPlan, prepare
 
 SUFFIXES = (".parquet", ".npz", ".json")
 """Of the files that a sweep's metrics are written to."""
@@ -79,14 +79,16 @@ def record_sweep(
     }
     folder = path if save_every else path.with_name(path.name + ".parts")
     first = jax.process_index() == 0
-    parts = [folder / f"part-{begin:09d}-{min(begin + work.size, work.total):09d}.npz" for begin in work.begins()]
+    parts = [
+        folder / f"part-{begin:09d}-{min(begin + work.size, work.total):09d}.npz" for begin in work.block_offsets()
+    ]
     if first:
         io.claim(folder / "sweep.json", {**document, "starts": _digest(work)})
     done = np.array([part.exists() for part in parts])
     if jax.process_count() > 1:
         done = np.asarray(multihost_utils.broadcast_one_to_all(done))
-    computed = work.blocks(begin for begin, there in zip(work.begins(), done, strict=True) if not there)
-    for begin, part, there in zip(work.begins(), parts, done, strict=True):
+    computed = work.blocks(begin for begin, there in zip(work.block_offsets(), done, strict=True) if not there)
+    for begin, part, there in zip(work.block_offsets(), parts, done, strict=True):
         if not there:
             columns = _columns(next(computed))
             if first:
@@ -152,7 +154,7 @@ def _described(component: Any) -> Any:
         return type(component).__name__
 
 
-def _digest(work: Work) -> str:
+def _digest(work: SweepPlan) -> str:
     """Returns a fingerprint of all that goes in."""
     digest = hashlib.sha256()
     # With classes, choices and functions; without addresses, which are others in each process.
@@ -164,7 +166,7 @@ def _digest(work: Work) -> str:
     return digest.hexdigest()
 
 
-def _starts(work: Work, begin: int, end: int) -> dict[str, np.ndarray]:
+def _starts(work: SweepPlan, begin: int, end: int) -> dict[str, np.ndarray]:
     columns = zip(work.names, work.leaves, strict=False)  # the initial state's leaves come first
     return {f"start.{name}": np.asarray(column)[begin:end] for name, column in columns}
 
@@ -183,7 +185,7 @@ def _npz(columns: Mapping[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def _assemble(path: Path, folder: Path, parts: list[Path], document: dict[str, Any], work: Work) -> Any:
+def _assemble(path: Path, folder: Path, parts: list[Path], document: dict[str, Any], work: SweepPlan) -> Any:
     """One file of all parts, which are then deleted."""
     loaded = []
     for part in parts:

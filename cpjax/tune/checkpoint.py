@@ -17,7 +17,7 @@ from cpjax.errors import InputError
 Numbers = np.ndarray[Any, Any]
 
 
-class Memory(NamedTuple):
+class TunerState(NamedTuple):
     """All that a tuning needs to go on: the content of its file."""
 
     step: int
@@ -35,7 +35,7 @@ class Memory(NamedTuple):
     gradient_steps: int
 
 
-def store(path: Path | None, identity: str, memory: Memory) -> None:
+def store(path: Path | None, identity: str, memory: TunerState) -> None:
     """Writes a memory, if there is a path.
 
     Args:
@@ -54,7 +54,7 @@ def store(path: Path | None, identity: str, memory: Memory) -> None:
     io.write_bytes(path, buffer.getvalue())
 
 
-def restore(path: Path | None, identity: str, optimiser: optax.GradientTransformation) -> Memory | None:
+def restore(path: Path | None, identity: str, optimiser: optax.GradientTransformation) -> TunerState | None:
     """The memory that was stored, if any.
 
     Raises:
@@ -75,4 +75,4 @@ def restore(path: Path | None, identity: str, optimiser: optax.GradientTransform
         raise InputError("checkpoint", str(path), allowed)
     state = jax.tree.unflatten(jax.tree.structure(blank), leaves)
     parts = {name: arrays[name] for name in ("vectors", "best", "scores")}
-    return Memory(optimiser=state, **parts, **note)
+    return TunerState(optimiser=state, **parts, **note)

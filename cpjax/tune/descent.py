@@ -17,7 +17,7 @@ def step(optimiser: optax.GradientTransformation, vectors: jax.Array, state: Any
     return jnp.where(jnp.isfinite(moved), moved, vectors), state
 
 
-def shortened(slopes: jax.Array, sound: jax.Array, clip: float) -> jax.Array:
+def clip_factors(slopes: jax.Array, sound: jax.Array, clip: float) -> jax.Array:
     """Factors (n,) that bring each gradient of (n, d) down to `clip` times the median norm of those that are sound."""
     norms = jnp.sqrt(jnp.sum(slopes * slopes, axis=1))
     median = jnp.nan_to_num(jnp.nanmedian(jnp.where(sound, norms, jnp.nan)))
@@ -35,6 +35,6 @@ def in_blocks(function: Any, block: int, *trees: Any) -> Any:
     return jax.tree.map(lambda *columns: np.concatenate(columns)[:count], *parts)
 
 
-def seed_of(seed: int, purpose: int, number: int) -> int:
+def derive_seed(seed: int, purpose: int, number: int) -> int:
     """A seed that no person types in: of starts that no evaluation uses."""
     return 2**32 + int(np.random.SeedSequence([seed, purpose, number]).generate_state(1)[0])

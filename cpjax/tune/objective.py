@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from cpjax.backend.extremes import larger
+from cpjax.backend.extremes import fast_maximum
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
@@ -78,7 +78,7 @@ class EnergyError(_Integral):
 
 
 @pytree
-class Jerkiness:
+class VoltageVariation:
     """The total variation of the applied voltage, its corners rounded [V]: a step of `rounding` counts about a half."""
 
     rounding: Scalar = number("V", "changes far smaller than this count little", default=0.1, above=0.0)
@@ -120,7 +120,7 @@ class TerminalCost:
 
 
 @pytree
-class Unfinished:
+class RemainingTime:
     """The time that a stopped run left undone [s]: counted as badly spent, so that being stopped gains nothing."""
 
     duration: Scalar = number("s", "of the whole run", above=0.0)
@@ -143,7 +143,7 @@ class Travel:
         return jnp.zeros_like(sample.time)
 
     def update(self, memory: jax.Array, sample: Sample) -> jax.Array:
-        return larger(memory, jnp.abs(sample.state.x))
+        return fast_maximum(memory, jnp.abs(sample.state.x))
 
     def finish(self, memory: jax.Array, last: Sample) -> jax.Array:
         return memory
@@ -179,7 +179,7 @@ class WeightedSum(_Several):
 
 
 @pytree
-class PricedTime(_Several):
+class Lagrangian(_Several):
     """The time outside the target with every cost at its price [s]; and the costs themselves.
 
     That is time + unfinished (1 + fine) + sum(price cost): the Lagrangian of a time that is minimised under bounds on
@@ -229,14 +229,14 @@ class Goal:
             "time": lambda: TimeOutside(width, width),
             "effort": Effort,
             "track": lambda: TrackExcess(limit, 0.1 * limit),
-            "jerkiness": Jerkiness,
+            "jerkiness": VoltageVariation,
             "energy": lambda: EnergyError(plant),
             "terminal": lambda: TerminalCost(width, width),
         }
         chosen = [name for name in WEIGHTS if float(getattr(self, name)) > 0.0]
         worst = float(self.time) + float(self.track) + float(self.energy)
         worst += float(self.effort) * supply * supply if math.isfinite(supply) else 0.0
-        terms = (*(makers[name]() for name in chosen), Unfinished(duration))
+        terms = (*(makers[name]() for name in chosen), RemainingTime(duration))
         return WeightedSum(terms, (*(float(getattr(self, name)) for name in chosen), worst))
 
 
@@ -291,3 +291,7 @@ def success_weighted(threshold: float, temperature: float) -> Aggregate:
 def _check_share(field: str, share: Any) -> None:
     if isinstance(share, (bool, str)) or not 0.0 < share <= 1.0:
         raise InputError(field, share, "above 0 and at most 1")
+
+
+Jerkiness, Unfinished, PricedTime = VoltageVariation, RemainingTime, Lagrangian
+"""The names until version 0.1."""

@@ -9,8 +9,8 @@ from cpjax import io
 from cpjax.controllers import Hybrid
 from cpjax.numeric.statistics import wilson_interval
 from cpjax.plant import CartPole
+from cpjax.tune.config import TuningConfig
 from cpjax.tune.parameters import FreeParameters
-from cpjax.tune.plan import Plan
 
 Numbers = np.ndarray[Any, Any]
 
@@ -47,7 +47,7 @@ class Tuning:
     seconds: float
 
 
-def request(plant: CartPole, free: FreeParameters, plan: Plan) -> dict[str, Any]:
+def request(plant: CartPole, free: FreeParameters, plan: TuningConfig) -> dict[str, Any]:
     """What a tuning depends on, as plain values: two of the same request end in the same bits on one machine."""
     return {
         "versions": io.versions(),
@@ -58,7 +58,7 @@ def request(plant: CartPole, free: FreeParameters, plan: Plan) -> dict[str, Any]
     }
 
 
-def document(tuning: Tuning, plant: CartPole, free: FreeParameters, plan: Plan) -> dict[str, Any]:
+def document(tuning: Tuning, plant: CartPole, free: FreeParameters, plan: TuningConfig) -> dict[str, Any]:
     """The result for programs; its controller is also a file of its own."""
     fields = {f.name: getattr(tuning, f.name) for f in dataclasses.fields(tuning) if f.name != "controller"}
     low, high = wilson_interval(round(tuning.success_rate * plan.final), plan.final)

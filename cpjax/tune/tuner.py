@@ -26,10 +26,10 @@ from cpjax.sim.flags import Flag
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import measure
 from cpjax.tune import descent
-from cpjax.tune.checkpoint import Memory, restore, store
+from cpjax.tune.checkpoint import TunerState, restore, store
+from cpjax.tune.config import TuningConfig
 from cpjax.tune.outcome import Tuning, request
 from cpjax.tune.parameters import FreeParameters, Vector
-from cpjax.tune.plan import Plan
 from cpjax.tune.plants import sample_plants
 
 Numbers = np.ndarray[Any, Any]
@@ -43,7 +43,7 @@ _BLOCK, _CONTROLLERS = 512, 64  # lanes that are simulated, and controllers that
 def tune(
     plant: CartPole,
     free: FreeParameters,
-    plan: Plan,
+    plan: TuningConfig,
     *,
     progress: Report | None = None,
     checkpoint: Path | None = None,
@@ -83,7 +83,7 @@ def tune(
 class _Tuner:
     """The compiled pieces."""
 
-    def __init__(self, plant: CartPole, free: FreeParameters, plan: Plan) -> None:
+    def __init__(self, plant: CartPole, free: FreeParameters, plan: TuningConfig) -> None:
         self.plant, self.free, self.plan = plant, free, plan
         schedule = optax.cosine_decay_schedule(plan.learning_rate, max(1, plan.steps), 0.05)
         self.optimiser = optax.adam(schedule)
@@ -102,11 +102,11 @@ class _Tuner:
         """Metrics of controllers (n,) from starts (n,), each on the plant or on one of its own."""
         return jax.jit(jax.vmap(functools.partial(self._run, **settings)))
 
-    def begin(self) -> Memory:
+    def begin(self) -> TunerState:
         """Screens the candidates; the first restart is the given controller."""
         plan = self.plan
         given = np.asarray(self.free.start())[None]
-        random = np.random.default_rng(descent.seed_of(plan.seed, _CANDIDATES, 0))
+        random = np.random.default_rng(descent.derive_seed(plan.seed, _CANDIDATES, 0))
         drawn = self.free.draw(random, plan.candidates, short_track=math.isfinite(plan.goal.track_limit))
         vectors = np.concatenate([given, drawn.astype(given.dtype)])
         starts, steps = plan.screening, 0
@@ -118,12 +118,12 @@ class _Tuner:
                 break
             vectors, starts = vectors[order[: max(plan.restarts, len(vectors) // 4)]], 4 * starts
         chosen = vectors[order[: plan.restarts]]
-        start = Memory(
+        start = TunerState(
             0, chosen, self.optimiser.init(jnp.asarray(chosen)), chosen, np.full(len(chosen), np.inf), 0, [], steps, 0
         )
         return self._validate(start, np.nan)
 
-    def advance(self, memory: Memory) -> Memory:
+    def advance(self, memory: TunerState) -> TunerState:
         """Up to the next validation."""
         plan = self.plan
         vectors, state = jnp.asarray(memory.vectors), memory.optimiser
@@ -140,7 +140,7 @@ class _Tuner:
         memory = self._validate(memory, float(jnp.min(loss)))
         return self._select(memory) if memory.step < plan.steps else memory
 
-    def _select(self, memory: Memory) -> Memory:
+    def _select(self, memory: TunerState) -> TunerState:
         """The worse half goes on from the best of the better half, a little aside (Jaderberg and others, 2017)."""
         plan = self.plan
         order = np.argsort(memory.scores, kind="stable")
@@ -148,7 +148,7 @@ class _Tuner:
         if half == 0 or plan.explore == 0.0:
             return memory
         losers, winners = order[len(order) - half :], order[:half]
-        random = np.random.default_rng(descent.seed_of(plan.seed, _NOISE, memory.step))
+        random = np.random.default_rng(descent.derive_seed(plan.seed, _NOISE, memory.step))
         size = plan.explore * (1.0 - memory.step / plan.steps)
         noise = size * random.standard_normal((half, memory.best.shape[1]))
         vectors, best, scores = (np.array(x) for x in (memory.vectors, memory.best, memory.scores))
@@ -162,7 +162,7 @@ class _Tuner:
             vectors=vectors, best=best, scores=scores, optimiser=jax.tree.map(inherited, memory.optimiser)
         )
 
-    def finish(self, memory: Memory, began: float) -> Tuning:
+    def finish(self, memory: TunerState, began: float) -> Tuning:
         """Compares the best restarts on more starts and takes the best of them."""
         plan = self.plan
         semifinal, _, _ = self._score(memory.best, plan.final, _SEMIFINAL)
@@ -186,7 +186,7 @@ class _Tuner:
             seconds=time.perf_counter() - began,
         )
 
-    def _validate(self, memory: Memory, loss: float) -> Memory:
+    def _validate(self, memory: TunerState, loss: float) -> TunerState:
         plan = self.plan
         scores, rates, times = self._score(memory.vectors, plan.validation, _VALIDATE)
         better = scores < memory.scores
@@ -216,10 +216,10 @@ class _Tuner:
     def _draw(self, count: int, purpose: int, step: int = 0) -> tuple[State, CartPole | None]:
         plan = self.plan
         dtype = np.dtype(jnp.result_type(float))
-        starts = sample_starts(plan.starts, count, seed=descent.seed_of(plan.seed, purpose, 2 * step), dtype=dtype)
+        starts = sample_starts(plan.starts, count, seed=descent.derive_seed(plan.seed, purpose, 2 * step), dtype=dtype)
         plants = None
         if plan.plant_spread > 0.0:
-            seed = descent.seed_of(plan.seed, purpose, 2 * step + 1)
+            seed = descent.derive_seed(plan.seed, purpose, 2 * step + 1)
             drawn = sample_plants(self.plant, count, spread=plan.plant_spread, seed=seed)
             plants = jax.tree.map(lambda column: jnp.asarray(column, dtype), drawn)
         return jax.tree.map(jnp.asarray, starts), plants
@@ -237,14 +237,14 @@ class _Tuner:
         values, slopes = jax.vmap(functools.partial(jax.value_and_grad(objective), vector))(starts, plants)
         sound = jnp.all(jnp.isfinite(slopes), axis=1) & jnp.isfinite(values)
         slopes = jnp.where(sound[:, None], slopes, 0.0)
-        shortened = descent.shortened(slopes, sound, plan.clip)
+        clip_factors = descent.clip_factors(slopes, sound, plan.clip)
         worst = jnp.max(jnp.where(sound, values, -jnp.inf))
         values = jnp.where(sound, values, worst)
         loss, shares = jax.value_and_grad(plan.aggregated)(values)
-        slope = jnp.sum((shares * shortened)[:, None] * slopes, axis=0) + jax.grad(self._haste)(vector)
+        slope = jnp.sum((shares * clip_factors)[:, None] * slopes, axis=0) + jax.grad(self._fast_pole_penalty)(vector)
         return loss, jnp.where(jnp.isfinite(slope), slope, 0.0)  # Adam would remember a NaN for ever
 
-    def _haste(self, vector: Vector) -> jax.Array:
+    def _fast_pole_penalty(self, vector: Vector) -> jax.Array:
         """Grows once the fastest closed-loop pole is near its limit."""
         excess = jnp.log(fastest_pole_bound(self._closed_loop(vector)) / (0.9 * self.plan.pole_limit))
         return 10.0 * jnp.maximum(excess, 0.0) ** 2

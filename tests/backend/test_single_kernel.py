@@ -59,16 +59,16 @@ def lowered(function, *arguments):
 
 def unmarked(monkeypatch):
     monkeypatch.setattr(runtime, "TESTED", ())
-    runtime.is_tested.cache_clear()
+    runtime.jaxlib_is_tested.cache_clear()
     with pytest.warns(cpjax.PerformanceWarning, match="was not tested with"):
-        runtime.is_tested()
+        runtime.jaxlib_is_tested()
     jax.clear_caches()
 
 
 @pytest.fixture(autouse=True)
 def fresh():
     yield
-    runtime.is_tested.cache_clear()
+    runtime.jaxlib_is_tested.cache_clear()
 
 
 @pytest.mark.parametrize("options", [{}, {"clock": "continuous", "switching": "located"}], ids=["per_step", "located"])

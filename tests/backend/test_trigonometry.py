@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tables import rows
 
-from cpjax.backend.trigonometry import LARGEST_TURN, sin_cos, turned
+from cpjax.backend.trigonometry import LARGEST_TURN, rotate_by, sin_cos
 from cpjax.numeric.angles import wrap_angle
 
 LARGEST = 1e4  # the angle up to which the accuracy is promised
@@ -107,7 +107,7 @@ def test_a_turned_sine_and_cosine_are_within_two_ulp_of_one(dtype, compiled):
     turn[:2] = dtype(LARGEST_TURN), -dtype(LARGEST_TURN)
     wide = WIDER[dtype](angle)
     known = (np.sin(wide).astype(dtype), np.cos(wide).astype(dtype))  # correctly rounded: half an ulp off
-    got = (jax.jit(turned) if compiled else turned)(*map(jnp.asarray, known), jnp.asarray(turn))
+    got = (jax.jit(rotate_by) if compiled else rotate_by)(*map(jnp.asarray, known), jnp.asarray(turn))
     exact = wide + WIDER[dtype](turn)
     for value, reference in zip(got, (np.sin(exact), np.cos(exact)), strict=True):
         assert value.dtype == dtype
@@ -119,7 +119,7 @@ def test_the_derivative_of_a_turn_is_that_of_sine_and_cosine(dtype):
     turn = jnp.linspace(-LARGEST_TURN, LARGEST_TURN, 101, dtype=dtype)
     known = sin_cos(jnp.asarray(1.1, dtype))
     for mode in (jax.jacfwd, jax.jacrev):
-        slopes = jax.vmap(mode(lambda by: turned(*known, by)))(turn)
+        slopes = jax.vmap(mode(lambda by: rotate_by(*known, by)))(turn)
         exact = np.cos(1.1 + np.asarray(turn, float)), -np.sin(1.1 + np.asarray(turn, float))
         for slope, reference in zip(slopes, exact, strict=True):
             # That of the series, which ends a power earlier.

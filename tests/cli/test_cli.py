@@ -39,10 +39,10 @@ from cpjax.cli.options import controller_title
 from cpjax.cli.reproduce import print_rows
 from cpjax.cli.swingup import OPTIONS
 from cpjax.paper import reproduction
-from cpjax.paper.reproduction import Setting, evaluate, reproduce, trajectory, variants
+from cpjax.paper.reproduction import EvaluationConfig, evaluate, reproduce, trajectory, variants
 from cpjax.study.summary import summarise
 
-SETTING = Setting(count=8, duration=12.0, dt=0.01)
+SETTING = EvaluationConfig(count=8, duration=12.0, dt=0.01)
 LONG = ("--duration", "12", "--dt", "0.01")
 SHORT = ("--duration", "0.1", "--dt", "0.01")
 PNG = b"\x89PNG\r\n"
@@ -675,7 +675,7 @@ def test_an_interrupted_reproduction_goes_on_where_it_stopped_and_ends_with_iden
 def partial(tmp_path, monkeypatch):
     """The file of a run that was interrupted after three rows; how many are computed when it is started again."""
     path = tmp_path / "reproduction.json"
-    setting = Setting(count=3)
+    setting = EvaluationConfig(count=3)
 
     def stop(*arguments):
         if arguments[0] == variants()[3]:
@@ -704,7 +704,7 @@ def test_an_unchanged_run_takes_over_the_rows_that_are_there(partial):
 
 @pytest.mark.parametrize("change", [{"seed": 2}, {"count": 4}, {"duration": 19.0}, {"dt": 0.001}, {"starts": "rest"}])
 def test_a_run_with_another_setting_starts_anew(partial, change):
-    assert partial.again(Setting(**{"count": 3, **change})) == 32
+    assert partial.again(EvaluationConfig(**{"count": 3, **change})) == 32
 
 
 def test_a_complete_run_is_computed_anew(partial):

@@ -13,7 +13,7 @@ from cpjax.cli.compare import representative_start
 from cpjax.controllers import LqrWeights, PoleFactors
 from cpjax.errors import InputError
 from cpjax.paper.comparison import DESIGNS, Compared, Entry, best, compare, entries
-from cpjax.paper.reproduction import Setting
+from cpjax.paper.reproduction import EvaluationConfig
 from cpjax.presets import preset
 from cpjax.show.comparison import findings, phase_portraits
 from cpjax.tune import tuner
@@ -126,7 +126,7 @@ def test_a_shipped_controller_is_what_its_design_gives_and_swings_up_every_start
 
 @pytest.mark.slow
 def test_a_comparison_has_the_papers_eight_and_two_tuned_and_ranks_the_tuned_first():
-    setting = Setting(count=16, duration=8.0, dt=0.004)
+    setting = EvaluationConfig(count=16, duration=8.0, dt=0.004)
     _, results = compare(PLANT, entries(PLANT), setting)
     assert [one.entry.gains for one in results].count("tuned") == 2
     assert len(results) == 10
@@ -145,7 +145,7 @@ def test_compare_writes_its_table_and_pictures(tmp_path, command):
 
 
 def test_a_comparison_in_which_nothing_settles_says_so_without_figures():
-    results = compare(PLANT, entries(PLANT), Setting(count=2, duration=1.5, dt=0.005))[1]
+    results = compare(PLANT, entries(PLANT), EvaluationConfig(count=2, duration=1.5, dt=0.005))[1]
     for sentence in findings(results):
         assert "catches none of the starts" in sentence
         assert "nan" not in sentence

@@ -103,7 +103,7 @@ def test_rk4_without_position_rows_is_the_textbook_method_to_rounding():
     plants, states, voltages = random_problem(31)
     steps = jnp.asarray(np.random.default_rng(34).uniform(1e-3, 0.1, voltages.size))
 
-    def shortened(plant, state, voltage, dt):
+    def clip_factors(plant, state, voltage, dt):
         def acceleration(q, v):
             rate = plant.vector_field(State(q["x"], v["x"], q["theta"], v["theta"]), voltage)
             return {"x": rate.x_dot, "theta": rate.theta_dot}
@@ -118,7 +118,7 @@ def test_rk4_without_position_rows_is_the_textbook_method_to_rounding():
 
         return textbook_rk4(field, state.vector(), dt)
 
-    got = jax.vmap(shortened)(plants, states, voltages, steps)
+    got = jax.vmap(clip_factors)(plants, states, voltages, steps)
     expected = jax.vmap(textbook)(plants, states, voltages, steps)
     rates = jax.vmap(CartPole.vector_field)(plants, states, voltages).vector()
     scale = np.linalg.norm(expected, axis=1) + steps * np.linalg.norm(rates, axis=1)

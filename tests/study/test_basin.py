@@ -10,13 +10,13 @@ from tables import rows
 import cpjax
 from cpjax import paper
 from cpjax.errors import InputError
-from cpjax.study.basin import Axis, Map, area, document
+from cpjax.study.basin import Axis, StartGrid, area, document
 
 ANGLE, RATE = Axis("theta", -3.0, 3.0, 30), Axis("theta_dot", -2.0, 6.0, 40)
 
 
 def test_every_cell_has_one_start_somewhere_inside_it():
-    chart = Map(ANGLE, RATE, {"x": (-0.1, 0.2)}, seed=3)
+    chart = StartGrid(ANGLE, RATE, {"x": (-0.1, 0.2)}, seed=3)
     starts = chart.starts()
     columns = np.floor((starts.theta + 3.0) / 0.2).astype(int)
     rows = np.floor((starts.theta_dot + 2.0) / 0.2).astype(int)
@@ -33,7 +33,7 @@ def test_the_area_of_a_disc_lies_in_its_interval_and_the_interval_shrinks_with_t
     """A disc of radius 1; its boundary passes through about 4 cells per cell of its diameter."""
     inside, widths = [], []
     for seed in range(100):
-        chart = Map(Axis("x", -1.5, 1.5, cells), Axis("x_dot", -1.5, 1.5, cells), seed=seed)
+        chart = StartGrid(Axis("x", -1.5, 1.5, cells), Axis("x_dot", -1.5, 1.5, cells), seed=seed)
         starts = chart.starts()
         found = area(chart, starts.x**2 + starts.x_dot**2 <= 1.0)
         inside.append(abs(found.value - math.pi) <= found.half_width)
@@ -44,7 +44,7 @@ def test_the_area_of_a_disc_lies_in_its_interval_and_the_interval_shrinks_with_t
 
 
 def test_of_a_map_without_a_boundary_the_interval_says_what_may_have_been_missed():
-    chart = Map(Axis("x", 0.0, 1.0, 10), Axis("x_dot", 0.0, 2.0, 10))
+    chart = StartGrid(Axis("x", 0.0, 1.0, 10), Axis("x_dot", 0.0, 2.0, 10))
     for success in (True, False):
         found = area(chart, np.full(100, success))
         assert found.value == 2.0 * success
@@ -53,7 +53,7 @@ def test_of_a_map_without_a_boundary_the_interval_says_what_may_have_been_missed
 
 def test_a_cells_outcome_is_that_of_a_rollout_from_its_start():
     plant, controller = paper.appendix_plant(), cpjax.preset("placement")
-    chart = Map(Axis("theta", -1.0, 1.0, 3), Axis("theta_dot", -4.0, 4.0, 3))
+    chart = StartGrid(Axis("theta", -1.0, 1.0, 3), Axis("theta_dot", -4.0, 4.0, 3))
     starts = chart.starts()
     metrics = cpjax.sweep(plant, controller, starts, duration=4.0, dt=0.002, clock="sampled")
     assert 0 < np.sum(metrics.success) <= 9
@@ -76,12 +76,12 @@ def test_a_cells_outcome_is_that_of_a_rollout_from_its_start():
         (lambda: Axis("x", None, 1.0), "Axis.low"),
         (lambda: Axis("x", np.array([0.0, 0.5]), 1.0), "Axis.low"),
         (lambda: Axis("x", 0.0, 1.0, 1), "Axis.cells"),
-        (lambda: Map(ANGLE, RATE, {"x": 0.0}), r"Map.others\[x\]"),
-        (lambda: Map(ANGLE, RATE, {"x": (0.0, "1")}), r"Map.others\[x\]"),
-        (lambda: Map(ANGLE, ANGLE), "Map.up"),
-        (lambda: Map(ANGLE, RATE, {"theta": (0.0, 0.0)}), "Map.others"),
-        (lambda: Map(ANGLE, RATE, {"x": (1.0, 0.0)}), r"Map.others\[x\]"),
-        (lambda: Map(ANGLE, RATE, seed=-1), "Map.seed"),
+        (lambda: StartGrid(ANGLE, RATE, {"x": 0.0}), r"Map.others\[x\]"),
+        (lambda: StartGrid(ANGLE, RATE, {"x": (0.0, "1")}), r"Map.others\[x\]"),
+        (lambda: StartGrid(ANGLE, ANGLE), "Map.up"),
+        (lambda: StartGrid(ANGLE, RATE, {"theta": (0.0, 0.0)}), "Map.others"),
+        (lambda: StartGrid(ANGLE, RATE, {"x": (1.0, 0.0)}), r"Map.others\[x\]"),
+        (lambda: StartGrid(ANGLE, RATE, seed=-1), "Map.seed"),
     ],
 )
 def test_bad_maps_are_refused(make, field):

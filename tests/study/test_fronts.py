@@ -12,13 +12,13 @@ from cpjax.errors import InputError
 from cpjax.numeric.pareto import nondominated
 from cpjax.show.front import Curve, findings
 from cpjax.sim.metrics import TimeOutside
-from cpjax.study.fronts.cache import Search, remembered
-from cpjax.study.fronts.config import COSTS, FrontPlan
-from cpjax.study.fronts.evaluator import Judged, layers
-from cpjax.study.fronts.reference_point import lanes, yardstick
+from cpjax.study.fronts.cache import Search, load_or_run
+from cpjax.study.fronts.config import COSTS, FrontConfig
+from cpjax.study.fronts.evaluator import Evaluated, nondominated_sort
+from cpjax.study.fronts.reference_point import lanes, reference_points
 from cpjax.study.fronts.trace import FOLDS, GRADIENT_STEP, trace_fronts
 from cpjax.tune.baseline import baseline
-from cpjax.tune.objective import Jerkiness, PricedTime, Unfinished
+from cpjax.tune.objective import Lagrangian, RemainingTime, VoltageVariation
 from cpjax.tune.parameters import free_parameters
 
 PLANT = paper.appendix_plant()
@@ -30,9 +30,9 @@ def test_the_time_that_is_minimised_has_every_cost_at_its_price():
     run = {"duration": 2.0, "dt": 0.005, "clock": "sampled"}
     protocol = cpjax.measure(PLANT, law, START, **run)
     time = cpjax.measure(PLANT, law, START, metrics=TimeOutside(0.05, 0.05), **run)
-    costs = [Jerkiness(1e-9) if name == "voltage_variation" else FOLDS[name] for name in COSTS]
-    terms = (TimeOutside(0.05, 0.05), *costs, Unfinished(2.0))
-    total, spent = cpjax.measure(PLANT, law, START, metrics=PricedTime(terms, (0.01, 2.0, 0.0), 10.0), **run)
+    costs = [VoltageVariation(1e-9) if name == "voltage_variation" else FOLDS[name] for name in COSTS]
+    terms = (TimeOutside(0.05, 0.05), *costs, RemainingTime(2.0))
+    total, spent = cpjax.measure(PLANT, law, START, metrics=Lagrangian(terms, (0.01, 2.0, 0.0), 10.0), **run)
     np.testing.assert_allclose(spent, [getattr(protocol, cost) for cost in COSTS], rtol=1e-5)
     assert float(total) == pytest.approx(float(time + 0.01 * protocol.effort + 2.0 * protocol.cart_travel))
 
@@ -40,7 +40,7 @@ def test_the_time_that_is_minimised_has_every_cost_at_its_price():
 def judged(rows):
     success, time, effort = np.array(rows).T
     costs = np.stack([effort, np.ones(len(rows)), np.ones(len(rows))], axis=1)
-    return Judged(np.arange(len(rows), dtype=float)[:, None], success, time, costs)
+    return Evaluated(np.arange(len(rows), dtype=float)[:, None], success, time, costs)
 
 
 def test_the_fastest_within_a_bound_never_fails_if_any_does_not():
@@ -56,12 +56,12 @@ def test_the_fastest_within_a_bound_never_fails_if_any_does_not():
 def test_where_none_settles_from_enough_starts_those_count_that_nearly_match_the_best():
     met = judged([(0.6, 3.0, 10.0), (0.59, 2.0, 20.0), (0.3, 1.0, 5.0)])
     assert met.fastest("effort", 100.0, 0.99) == (1.0, 2.0)
-    assert met.ladder("effort", FrontPlan(bounds=2)).tolist() == pytest.approx([8.5, 20.0, math.inf])
+    assert met.epsilon_grid("effort", FrontConfig(bounds=2)).tolist() == pytest.approx([8.5, 20.0, math.inf])
 
 
 @pytest.mark.slow
 def test_the_reference_is_the_same_for_both_designs_and_beyond_their_bland_starts():
-    found = yardstick(PLANT, FrontPlan(final=64))
+    found = reference_points(PLANT, FrontConfig(final=64))
     for lane in lanes(PLANT):
         points = np.array([found.bland[design][lane] for design in ("lqr", "placement")])
         np.testing.assert_allclose(found.reference[lane], 1.1 * points.max(axis=0))
@@ -70,15 +70,15 @@ def test_the_reference_is_the_same_for_both_designs_and_beyond_their_bland_start
 def test_a_supply_at_which_nothing_settles_is_named():
     weak = dataclasses.replace(PLANT, motor=dataclasses.replace(PLANT.motor, voltage_limit=1.0))
     with pytest.raises(InputError, match="voltage_limit"):
-        yardstick(weak, FrontPlan(final=8, horizon=2.0))
+        reference_points(weak, FrontConfig(final=8, horizon=2.0))
 
 
 def test_layers_begin_with_what_no_other_beats_and_end_with_what_is_finite():
     points = np.array([[9.0, 90.0], [1.0, 5.0], [2.0, 4.0], [3.0, 6.0], [np.inf, np.inf]])
-    assert layers(points, 2).tolist() == [1, 2]
-    assert layers(points, 3).tolist() == [1, 2, 3]
-    assert sorted(layers(points, 100)) == [0, 1, 2, 3]
-    assert layers(points[4:], 2).tolist() == [0]
+    assert nondominated_sort(points, 2).tolist() == [1, 2]
+    assert nondominated_sort(points, 3).tolist() == [1, 2, 3]
+    assert sorted(nondominated_sort(points, 100)) == [0, 1, 2, 3]
+    assert nondominated_sort(points[4:], 2).tolist() == [0]
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_layers_begin_with_what_no_other_beats_and_end_with_what_is_finite():
 )
 def test_a_bad_plan_is_refused(change, field):
     with pytest.raises(InputError, match=field):
-        FrontPlan(**change)
+        FrontConfig(**change)
 
 
 def test_the_sentences_say_of_each_design_what_either_search_found():
@@ -126,20 +126,20 @@ def test_a_search_that_is_done_is_read_again_to_the_last_bit(tmp_path):
         7.5,
     )
     path = tmp_path / "search.npz"
-    assert remembered(path, lambda: found) is found
-    again = remembered(path, lambda: pytest.fail("searched again"))
+    assert load_or_run(path, lambda: found) is found
+    again = load_or_run(path, lambda: pytest.fail("searched again"))
     assert again[1:] == found[1:]
     assert list(again.met) == [12.0, 0.1]
     for supply, one in found.met.items():
         for kept, column in zip(again.met[supply], one, strict=True):
             np.testing.assert_array_equal(kept, column)
-    assert remembered(None, lambda: found) is found
+    assert load_or_run(None, lambda: found) is found
 
 
 @pytest.mark.slow
 def test_a_small_front_is_made_of_controllers_that_do_what_its_points_say():
-    plan = FrontPlan(bounds=6, candidates=1024, steps=6, judge_every=3, semifinal=64, final=128, horizon=10.0)
-    measure = yardstick(PLANT, plan, (24.0,))
+    plan = FrontConfig(bounds=6, candidates=1024, steps=6, judge_every=3, semifinal=64, final=128, horizon=10.0)
+    measure = reference_points(PLANT, plan, (24.0,))
     told = []
     found = trace_fronts(
         PLANT, "placement", plan, measure.reference, supplies=(24.0,), report=lambda *what: told.append(what)

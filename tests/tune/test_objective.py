@@ -10,9 +10,9 @@ from cpjax.tune.baseline import baseline
 from cpjax.tune.objective import (
     Effort,
     Goal,
-    Jerkiness,
     TerminalCost,
     TrackExcess,
+    VoltageVariation,
     WeightedSum,
     soft_maximum,
     success_weighted,
@@ -26,11 +26,11 @@ RUN = {"duration": 3.0, "dt": 0.005}
 
 
 def test_terms_are_the_integrals_they_say():
-    fold = WeightedSum((Effort(), Jerkiness(1e-9), TrackExcess(0.3, 0.1), TerminalCost()), (1.0, 0.0, 0.0, 0.0))
+    fold = WeightedSum((Effort(), VoltageVariation(1e-9), TrackExcess(0.3, 0.1), TerminalCost()), (1.0, 0.0, 0.0, 0.0))
     kept = cpjax.rollout(PLANT, LAW, START, clock="sampled", metrics=fold, **RUN)
     protocol = cpjax.measure(PLANT, LAW, START, clock="sampled", **RUN)
     assert float(kept.metrics) == pytest.approx(float(protocol.effort), rel=1e-12)
-    jerk = cpjax.measure(PLANT, LAW, START, clock="sampled", metrics=Jerkiness(1e-9), **RUN)
+    jerk = cpjax.measure(PLANT, LAW, START, clock="sampled", metrics=VoltageVariation(1e-9), **RUN)
     assert float(jerk) == pytest.approx(float(protocol.voltage_variation), rel=1e-6)
     excess = cpjax.measure(PLANT, LAW, START, clock="sampled", metrics=TrackExcess(0.3, 0.1), **RUN)
     over = np.maximum(np.abs(np.asarray(kept.state.x)) - 0.2, 0.0) / 0.1

@@ -10,13 +10,13 @@ from cpjax import paper
 from cpjax.errors import InputError
 from cpjax.tune.baseline import baseline
 from cpjax.tune.checkpoint import restore, store
+from cpjax.tune.config import AGGREGATES, TuningConfig
 from cpjax.tune.parameters import free_parameters
-from cpjax.tune.plan import AGGREGATES, Plan
 from cpjax.tune.plants import UNCERTAIN, sample_plants
 from cpjax.tune.tuner import _Tuner, tune
 
 PLANT = paper.appendix_plant()
-SMALL = Plan(
+SMALL = TuningConfig(
     candidates=6, screening=2, restarts=4, batch=2, steps=4, validate_every=2, validation=4, final=4,
     duration=2.0, horizon=3.0, final_horizon=3.0, final_dt=0.005,
 )  # fmt: skip
@@ -113,7 +113,7 @@ def test_starts_are_drawn_anew_as_often_as_the_plan_says(resample, batches, monk
 @pytest.mark.parametrize("aggregate", AGGREGATES)
 def test_a_batch_is_aggregated_as_the_plan_says(aggregate):
     values = jnp.asarray([1.0, 2.0, 6.0])
-    plan = Plan(aggregate=aggregate, tail=0.34, temperature=0.1, threshold=4.0)
+    plan = TuningConfig(aggregate=aggregate, tail=0.34, temperature=0.1, threshold=4.0)
     expected = {"tail": 6.0, "soft-maximum": 6.0 - 0.1 * math.log(3.0), "success-weighted": 1.5}[aggregate]
     assert float(plan.aggregated(values)) == pytest.approx(expected, abs=1e-6)
 
@@ -142,7 +142,7 @@ def test_a_start_that_cannot_be_simulated_does_no_harm(tuner):
 )
 def test_a_bad_plan_is_refused(field, value):
     with pytest.raises(InputError):
-        Plan(**{field: value})
+        TuningConfig(**{field: value})
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_a_bad_plan_is_refused(field, value):
 )
 def test_a_length_that_is_no_whole_number_of_steps_has_its_own_name(step, field):
     with pytest.raises(InputError) as caught:
-        Plan(**{step: 0.7})
+        TuningConfig(**{step: 0.7})
     assert caught.value.field == field
 
 

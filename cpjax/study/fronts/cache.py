@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cpjax import io
-from cpjax.study.fronts.evaluator import Judged
+from cpjax.study.fronts.evaluator import Evaluated
 
 _COUNTS = ("begun", "values", "gradients")
 
@@ -16,7 +16,7 @@ _COUNTS = ("begun", "values", "gradients")
 class Search(NamedTuple):
     """All by supply [V]."""
 
-    met: Mapping[float, Judged]
+    met: Mapping[float, Evaluated]
     """Every controller that was judged by more than the screening."""
     begun: Mapping[float, int]
     """How many of them the candidates gave."""
@@ -28,13 +28,15 @@ class Search(NamedTuple):
     """Not by supply: what the search took."""
 
 
-def remembered(path: Path | None, search: Callable[[], Search]) -> Search:
+def load_or_run(path: Path | None, search: Callable[[], Search]) -> Search:
     """What the file holds, or else what `search` finds, then written there; no `path`, no file."""
     if path is not None and path.exists():
         with np.load(path) as archive:
             columns = dict(archive)
         supplies = columns["supplies"].tolist()
-        met = {supply: Judged(*(columns[f"{i}.{n}"] for n in Judged._fields)) for i, supply in enumerate(supplies)}
+        met = {
+            supply: Evaluated(*(columns[f"{i}.{n}"] for n in Evaluated._fields)) for i, supply in enumerate(supplies)
+        }
         begun, values, gradients = (dict(zip(supplies, columns[name].tolist(), strict=True)) for name in _COUNTS)
         return Search(met, begun, values, gradients, float(columns["seconds"]))
     found = search()

@@ -4,7 +4,7 @@ import dataclasses
 from typing import TypeAlias
 
 from cpjax.pytree import Number
-from cpjax.tune.plan import check_plan
+from cpjax.tune.config import check_plan
 
 COSTS = ("effort", "cart_travel", "voltage_variation")
 """Of `Metrics`, against the settling time."""
@@ -14,7 +14,7 @@ Lane: TypeAlias = tuple[float, str]
 
 
 @dataclasses.dataclass(frozen=True)
-class FrontPlan:
+class FrontConfig:
     """How fronts are traced.
 
     Attributes:
@@ -114,3 +114,7 @@ _NUMBERS = {
     "final_dt": Number("s", "", above=0.0),
     "success": Number("1", "", above=0.0, at_most=1.0),
 }
+
+
+FrontPlan = FrontConfig
+"""The name until version 0.1."""

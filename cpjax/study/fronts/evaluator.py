@@ -18,9 +18,9 @@ from cpjax.plant.initial_states import sample_starts
 from cpjax.plant.state import State
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.sweep import sweep
-from cpjax.study.fronts.config import COSTS, FrontPlan
+from cpjax.study.fronts.config import COSTS, FrontConfig
 from cpjax.tune.baseline import baseline
-from cpjax.tune.descent import in_blocks, seed_of
+from cpjax.tune.descent import derive_seed, in_blocks
 from cpjax.tune.parameters import FreeParameters, free_parameters
 
 Numbers = np.ndarray[Any, Any]
@@ -31,7 +31,7 @@ SCREEN, BATCH, JUDGE, SEMIFINAL, FINAL, CANDIDATES, EXPLORE = range(7)
 _RUNS, _CONTROLLERS = 2048, 64  # simulated, and designed, at a time
 
 
-class Judged(NamedTuple):
+class Evaluated(NamedTuple):
     """Controllers and what they were found to be worth."""
 
     vectors: Numbers
@@ -66,7 +66,7 @@ class Judged(NamedTuple):
         found = int(among[np.argsort(worth[among], kind="stable")[min(rank, len(among) - 1)]])
         return self.vectors[found], float(time[found]) if len(within) else math.inf
 
-    def ladder(self, cost: str, plan: FrontPlan) -> Numbers:
+    def epsilon_grid(self, cost: str, plan: FrontConfig) -> Numbers:
         """Bounds of a cost (bounds + 1,)."""
         points = self.points(cost, self.enough(plan.success))
         points = points[np.isfinite(points[:, 0])]
@@ -76,7 +76,7 @@ class Judged(NamedTuple):
         return np.append(np.geomspace(plan.lowest * np.min(points[:, 1]), fastest, plan.bounds), np.inf)
 
 
-class Judge:
+class Evaluator:
     """Builds one design's controllers of their free parameters, at any supply, and counts what it costs to judge them.
 
     Attributes:
@@ -84,7 +84,7 @@ class Judge:
       steps: Runge-Kutta steps simulated so far, by supply [V].
     """
 
-    def __init__(self, plant: CartPole, design: DesignName, plan: FrontPlan) -> None:
+    def __init__(self, plant: CartPole, design: DesignName, plan: FrontConfig) -> None:
         self._plant, self._design, self._plan = plant, design, plan
         self.free = free_parameters(baseline(design, plant))
         self.steps: Counter[float] = Counter()
@@ -104,10 +104,10 @@ class Judge:
 
     def starts(self, count: int, purpose: int, number: int = 0) -> State:
         """Starts that no person's seed names."""
-        seed = seed_of(self._plan.seed, purpose, number)
+        seed = derive_seed(self._plan.seed, purpose, number)
         return sample_starts("hanging", count, seed=seed, dtype=np.dtype(jnp.result_type(float)))
 
-    def judge(self, vectors: Numbers, supply: float, count: int, purpose: int) -> Judged:
+    def evaluate(self, vectors: Numbers, supply: float, count: int, purpose: int) -> Evaluated:
         """Controllers (n, d) by the protocol's metrics from so many starts, all the same."""
         plan, plant, starts = self._plan, self.plant_at(supply), self.starts(count, purpose)
         dt = plan.final_dt if purpose in (SEMIFINAL, FINAL) else plan.judging_dt
@@ -135,9 +135,9 @@ class Judge:
             return np.where(total > 0, summed / np.maximum(total, 1), np.inf)
 
         costs = np.stack([mean(getattr(table, cost)) for cost in COSTS], axis=1)
-        return Judged(vectors, total / count, mean(table.settling_time), costs)
+        return Evaluated(vectors, total / count, mean(table.settling_time), costs)
 
-    def begin(self, supply: float, count: int, number: int) -> Judged:
+    def begin(self, supply: float, count: int, number: int) -> Evaluated:
         """The bland start and `count` random candidates from ranges that suit the supply; the better ones of each cost
         judged on more starts."""
         plan = self._plan
@@ -147,14 +147,16 @@ class Judge:
         gentle = count // 2  # who pumps gently, in more swings, needs less room
         draws = free.draw(random, count - gentle), free.draw(random, gentle, short_track=True)
         drawn = np.concatenate([bland, *draws]).astype(bland.dtype)
-        screened = self.judge(drawn, supply, plan.screening, SCREEN)
+        screened = self.evaluate(drawn, supply, plan.screening, SCREEN)
         better: set[int] = {0}
         for cost in COSTS:
-            better.update(map(int, layers(screened.points(cost, screened.enough(plan.success)), 4 * plan.bounds)))
-        return self.judge(screened.vectors[sorted(better)], supply, plan.judging, JUDGE)
+            better.update(
+                map(int, nondominated_sort(screened.points(cost, screened.enough(plan.success)), 4 * plan.bounds))
+            )
+        return self.evaluate(screened.vectors[sorted(better)], supply, plan.judging, JUDGE)
 
 
-def layers(points: Numbers, least: int) -> Numbers:
+def nondominated_sort(points: Numbers, least: int) -> Numbers:
     """Indices of the points (n, 2) that no other beats, then of those that only they beat, and so on, until there are
     `least` or no more that are finite; the first point if none is.
     """
@@ -165,6 +167,6 @@ def layers(points: Numbers, least: int) -> Numbers:
     return chosen if len(chosen) else np.zeros(1, int)
 
 
-def together(parts: list[Judged]) -> Judged:
+def concatenate(parts: list[Evaluated]) -> Evaluated:
     """All controllers of several lists."""
-    return Judged(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return Evaluated(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))

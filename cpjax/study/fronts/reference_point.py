@@ -9,14 +9,14 @@ import numpy as np
 from cpjax.controllers import DesignName
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
-from cpjax.study.fronts.config import COSTS, FrontPlan, Lane
-from cpjax.study.fronts.evaluator import FINAL, Judge
+from cpjax.study.fronts.config import COSTS, FrontConfig, Lane
+from cpjax.study.fronts.evaluator import FINAL, Evaluator
 
 Numbers = np.ndarray[Any, Any]
 
 
 @dataclasses.dataclass(frozen=True)
-class Yardstick:
+class ReferencePoints:
     """What fronts are measured by, the same for all designs.
 
     Attributes:
@@ -39,7 +39,7 @@ def lanes(plant: CartPole, supplies: tuple[float, ...] = ()) -> list[Lane]:
     return [*((own, cost) for cost in COSTS), *((supply, "effort") for supply in others)]
 
 
-def yardstick(plant: CartPole, plan: FrontPlan, supplies: tuple[float, ...] = ()) -> Yardstick:
+def reference_points(plant: CartPole, plan: FrontConfig, supplies: tuple[float, ...] = ()) -> ReferencePoints:
     """From runs of the bland controllers.
 
     Raises:
@@ -48,9 +48,11 @@ def yardstick(plant: CartPole, plan: FrontPlan, supplies: tuple[float, ...] = ()
     wanted = lanes(plant, supplies)
     bland: dict[DesignName, dict[Lane, Numbers]] = {}
     for design in get_args(DesignName):
-        judge = Judge(plant, design, plan)
-        start = np.asarray(judge.free.start())[None]
-        found = {supply: judge.judge(start, supply, plan.final, FINAL) for supply in {supply for supply, _ in wanted}}
+        evaluator = Evaluator(plant, design, plan)
+        start = np.asarray(evaluator.free.start())[None]
+        found = {
+            supply: evaluator.evaluate(start, supply, plan.final, FINAL) for supply in {supply for supply, _ in wanted}
+        }
         bland[design] = {
             lane: np.where(np.isfinite(point := found[lane[0]].points(lane[1], 0.5)[0]), point, np.nan)
             for lane in wanted
@@ -65,4 +67,4 @@ def yardstick(plant: CartPole, plan: FrontPlan, supplies: tuple[float, ...] = ()
                 "plant.motor.voltage_limit", own, "enough for the bland controller to settle from half of the starts"
             )
         reference[lane] = 1.1 * np.max(points, axis=0) if len(points) else reference[own, lane[1]]
-    return Yardstick(bland, reference)
+    return ReferencePoints(bland, reference)

@@ -33,19 +33,29 @@ from cpjax.plant import CartPole
 from cpjax.plant.state import State
 from cpjax.sim.metrics import TimeOutside
 from cpjax.sim.rollout import measure
-from cpjax.study.fronts.cache import Search, remembered
-from cpjax.study.fronts.config import COSTS, FrontPlan, Lane
-from cpjax.study.fronts.evaluator import BATCH, EXPLORE, FINAL, JUDGE, SEMIFINAL, Judge, Judged, layers, together
+from cpjax.study.fronts.cache import Search, load_or_run
+from cpjax.study.fronts.config import COSTS, FrontConfig, Lane
+from cpjax.study.fronts.evaluator import (
+    BATCH,
+    EXPLORE,
+    FINAL,
+    JUDGE,
+    SEMIFINAL,
+    Evaluated,
+    Evaluator,
+    concatenate,
+    nondominated_sort,
+)
 from cpjax.study.fronts.reference_point import lanes
 from cpjax.tune import descent
-from cpjax.tune.objective import Effort, Jerkiness, PricedTime, Travel, Unfinished
+from cpjax.tune.objective import Effort, Lagrangian, RemainingTime, Travel, VoltageVariation
 
 Numbers = np.ndarray[Any, Any]
 Report = Callable[[int, int, str], None]
 GRADIENT_STEP = 60.0
 """Steps of the fastest values that take as long as one of a gradient of these tunings (`experiments/tuner_cost.py`)."""
 
-FOLDS: Mapping[str, Any] = {"effort": Effort(), "cart_travel": Travel(), "voltage_variation": Jerkiness()}
+FOLDS: Mapping[str, Any] = {"effort": Effort(), "cart_travel": Travel(), "voltage_variation": VoltageVariation()}
 """What is differentiable of each of `COSTS`."""
 
 
@@ -89,7 +99,7 @@ class Fronts:
 def trace_fronts(
     plant: CartPole,
     design: DesignName,
-    plan: FrontPlan,
+    plan: FrontConfig,
     reference: Mapping[Lane, Numbers],
     *,
     supplies: tuple[float, ...] = (),
@@ -111,34 +121,34 @@ def trace_fronts(
     wanted = lanes(plant, supplies)
     everywhere = list(dict.fromkeys(supply for supply, _ in wanted))
     parts = plan.steps + len(everywhere) + 2 * len(wanted)
-    judge = Judge(plant, design, plan)
+    evaluator = Evaluator(plant, design, plan)
 
     def trace() -> Search:
         begin = time.perf_counter()
-        judge.steps = Counter()
+        evaluator.steps = Counter()
         report(0, parts, "screening candidates")
-        begun = {supply: judge.begin(supply, plan.candidates, 0) for supply in everywhere}
-        tracer = Tracer(judge, plan)
+        begun = {supply: evaluator.begin(supply, plan.candidates, 0) for supply in everywhere}
+        tracer = Tracer(evaluator, plan)
         met = tracer.trace(begun, wanted, lambda done, text: report(done, parts, text))
         counts = {supply: len(one.vectors) for supply, one in begun.items()}
-        return Search(met, counts, judge.steps, tracer.steps, time.perf_counter() - begin)
+        return Search(met, counts, evaluator.steps, tracer.steps, time.perf_counter() - begin)
 
     def draw() -> Search:
         # For each supply as much work; as many as the tracing's are judged a second time, the rest goes into screening.
         begin = time.perf_counter()
-        judge.steps = Counter()
+        evaluator.steps = Counter()
         drawn = {}
         run = round(plan.horizon / plan.judging_dt)
         for number, supply in enumerate(everywhere):
             report(plan.steps + number, parts, f"random search of the same cost, {supply:g} V")
             budget = traced.values[supply] + GRADIENT_STEP * traced.gradients[supply]
             budget -= run * plan.judging * traced.begun[supply]
-            drawn[supply] = judge.begin(supply, max(1, int(budget / (run * plan.screening))), 1)
+            drawn[supply] = evaluator.begin(supply, max(1, int(budget / (run * plan.screening))), 1)
         counts = {supply: len(one.vectors) for supply, one in drawn.items()}
-        return Search(drawn, counts, judge.steps, dict.fromkeys(everywhere, 0), time.perf_counter() - begin)
+        return Search(drawn, counts, evaluator.steps, dict.fromkeys(everywhere, 0), time.perf_counter() - begin)
 
-    traced = remembered(memory and memory / "traced.npz", trace)
-    random = remembered(memory and memory / "random.npz", draw)
+    traced = load_or_run(memory and memory / "traced.npz", trace)
+    random = load_or_run(memory and memory / "random.npz", draw)
     steps = {
         supply: {
             "values": traced.values[supply],
@@ -154,19 +164,23 @@ def trace_fronts(
         fronts.append({})
         for number, lane in enumerate(wanted):
             report(parts - (2 - which) * len(wanted) + number, parts, "measuring the points")
-            fronts[-1][lane] = _front(judge, plan, found[lane[0]], *lane, reference[lane])
+            fronts[-1][lane] = _front(evaluator, plan, found[lane[0]], *lane, reference[lane])
     report(parts, parts, "done")
     return Fronts(fronts[0], fronts[1], steps, traced.seconds + random.seconds + time.perf_counter() - begin)
 
 
-def _front(judge: Judge, plan: FrontPlan, met: Judged, supply: float, cost: str, reference: Numbers) -> Front:
+def _front(
+    evaluator: Evaluator, plan: FrontConfig, met: Evaluated, supply: float, cost: str, reference: Numbers
+) -> Front:
     """Of all controllers met, those that no other beats, measured once more from unseen starts."""
     # Few starts say little about one failure in a hundred: who failed a few of them may run in the semifinal.
     lenient = met.enough(1.0 - 3.0 * (1.0 - plan.success))
-    chosen = np.unique(np.concatenate([layers(met.points(cost, share), 3 * plan.bounds) for share in (1.0, lenient)]))
-    semifinal = judge.judge(met.vectors[chosen], supply, plan.semifinal, SEMIFINAL)
-    chosen = chosen[layers(semifinal.points(cost, plan.success), plan.bounds)]
-    final = judge.judge(met.vectors[chosen], supply, plan.final, FINAL)
+    chosen = np.unique(
+        np.concatenate([nondominated_sort(met.points(cost, share), 3 * plan.bounds) for share in (1.0, lenient)])
+    )
+    semifinal = evaluator.evaluate(met.vectors[chosen], supply, plan.semifinal, SEMIFINAL)
+    chosen = chosen[nondominated_sort(semifinal.points(cost, plan.success), plan.bounds)]
+    final = evaluator.evaluate(met.vectors[chosen], supply, plan.final, FINAL)
     points = final.points(cost, plan.success)
     kept = nondominated(points)
     return Front(
@@ -196,8 +210,8 @@ class Tracer:
       gradient: slopes (n, d) and mean costs (n, number of `COSTS`) of controllers (n, d), aims (n,) and starts.
     """
 
-    def __init__(self, judge: Judge, plan: FrontPlan) -> None:
-        self._judge, self._plan = judge, plan
+    def __init__(self, evaluator: Evaluator, plan: FrontConfig) -> None:
+        self._judge, self._plan = evaluator, plan
         self.steps: Counter[float] = Counter()
         self._optimiser = optax.adam(optax.cosine_decay_schedule(plan.learning_rate, max(1, plan.steps), 0.1))
         self._spare = math.ceil(plan.spare_rate * plan.duration)
@@ -211,11 +225,11 @@ class Tracer:
         self.gradient = jax.jit(jax.shard_map(each, mesh=mesh, check_vma=False, **specs))
 
     def trace(
-        self, begun: dict[float, Judged], fronts: list[Lane], report: Callable[[int, str], None]
-    ) -> dict[float, Judged]:
+        self, begun: dict[float, Evaluated], fronts: list[Lane], report: Callable[[int, str], None]
+    ) -> dict[float, Evaluated]:
         """All controllers met, by supply: what `begun` has, and all that were judged on the way."""
         plan = self._plan
-        jobs = [(supply, cost, bound) for supply, cost in fronts for bound in begun[supply].ladder(cost, plan)]
+        jobs = [(supply, cost, bound) for supply, cost in fronts for bound in begun[supply].epsilon_grid(cost, plan)]
         # Every device has as many tunings: the last is done more than once if need be.
         jobs += [jobs[-1]] * (-len(jobs) % len(jax.devices()))
         bounds = np.full((len(jobs), len(COSTS)), np.inf)
@@ -240,8 +254,8 @@ class Tracer:
                 times = np.full(len(jobs), np.inf)
                 for supply in met:
                     rows = np.flatnonzero(supplies == supply)
-                    judged = self._judge.judge(np.asarray(vectors)[rows], supply, plan.judging, JUDGE)
-                    met[supply] = together([met[supply], judged])
+                    judged = self._judge.evaluate(np.asarray(vectors)[rows], supply, plan.judging, JUDGE)
+                    met[supply] = concatenate([met[supply], judged])
                     well = judged.success >= met[supply].enough(plan.success)
                     kept = well & np.all(judged.costs <= bounds[rows], axis=1)
                     times[rows] = np.where(kept, judged.time, np.inf)
@@ -259,8 +273,8 @@ class Tracer:
         """Of the mean over the starts, no start's sensitivity drowning the others'; and the mean costs."""
         plan, plant, free = self._plan, self._judge.plant_at(aim.supply), self._judge.free_at(aim.supply)
         costs = (FOLDS[cost] for cost in COSTS)
-        terms = (TimeOutside(plan.width, plan.width), *costs, Unfinished(plan.duration))
-        fold = PricedTime(terms, tuple(aim.prices), plan.fine)
+        terms = (TimeOutside(plan.width, plan.width), *costs, RemainingTime(plan.duration))
+        fold = Lagrangian(terms, tuple(aim.prices), plan.fine)
 
         def objective(vector: jax.Array, start: State) -> tuple[jax.Array, tuple[jax.Array, ...]]:
             found: tuple[jax.Array, tuple[jax.Array, ...]] = measure(
@@ -278,7 +292,7 @@ class Tracer:
         slopes, spent = jax.vmap(jax.grad(objective, has_aux=True), in_axes=(None, 0))(vector, starts)
         sound = jnp.all(jnp.isfinite(slopes), axis=1)
         slopes = jnp.where(sound[:, None], slopes, 0.0)
-        slope = jnp.mean(descent.shortened(slopes, sound, plan.clip)[:, None] * slopes, axis=0)
+        slope = jnp.mean(descent.clip_factors(slopes, sound, plan.clip)[:, None] * slopes, axis=0)
         return slope, jnp.mean(jnp.nan_to_num(jnp.stack(spent, axis=1)), axis=0)
 
 

@@ -15,7 +15,7 @@ from cpjax.tune.objective import Aggregate, Goal, soft_maximum, success_weighted
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class TuningConfig:
     """A tuning draws candidates, lets gradients improve the best of them, and keeps what validates best.
 
     Attributes:
@@ -150,13 +150,13 @@ def check_plan(
 
 _MOST = 10_000_000  # of whatever is counted: more would not fit a memory
 
-_AGGREGATES: Mapping[str, Callable[[Plan], Aggregate]] = {
+_AGGREGATES: Mapping[str, Callable[[TuningConfig], Aggregate]] = {
     "tail": lambda plan: tail_mean(plan.tail),
     "soft-maximum": lambda plan: soft_maximum(plan.temperature),
     "success-weighted": lambda plan: success_weighted(plan.threshold, plan.temperature),
 }
 AGGREGATES = tuple(_AGGREGATES)
-"""Names that a `Plan` knows."""
+"""Names that a `TuningConfig` knows."""
 
 _COUNTS = {
     "seed": 0,
@@ -191,3 +191,7 @@ _NUMBERS = {
     "final_dt": Number("s", "", above=0.0),
     "horizon_dt": Number("s", "", above=0.0),
 }
+
+
+Plan = TuningConfig
+"""The name until version 0.1."""
