@@ -29,11 +29,11 @@ Cases = dict[str, tuple[Callable[[], Any], float, int]]
 """By name: what to call, its work (million steps, or calls), and how often a lap calls it."""
 
 
-def cases() -> Cases:
-    """Returns the cases with the package that this process has imported."""
+def cases(configured: bool = True) -> Cases:
+    """Returns the cases with the package that this process has imported, with or without the compiler's options."""
     import cpjax
 
-    cpjax.configure_cpu()
+    cpjax.configure_cpu(**{} if configured else {"gradients": True})
     import jax
     import jax.numpy as jnp
 
@@ -81,13 +81,12 @@ def cases() -> Cases:
     return found
 
 
-def answer() -> None:
+def answer(known: Cases) -> None:
     """Runs the case named by each line of standard input and prints its seconds."""
     import jax
 
     import cpjax
 
-    known = cases()
     print(json.dumps({"from": cpjax.__file__, "cases": list(known)}), flush=True)
     begun: set[str] = set()
     for line in sys.stdin:
@@ -103,9 +102,9 @@ def answer() -> None:
 class Child:
     """A process that imports the package from a tree."""
 
-    def __init__(self, tree: Path, folder: str) -> None:
+    def __init__(self, tree: Path, folder: str | Path, script: str = __file__, options: tuple[str, ...] = ()) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, __file__, "--child"],
+            [sys.executable, script, "--child", *options],
             env=os.environ | {"PYTHONPATH": str(tree)},
             cwd=folder,
             stdin=subprocess.PIPE,
@@ -132,7 +131,7 @@ class Child:
         return float(self._line())
 
 
-def main(out: Path, against: str, quick: bool, laps: int, case: str = "") -> dict[str, Any]:
+def main(out: Path, quick: bool = False, against: str = "HEAD", laps: int = 20, case: str = "") -> dict[str, Any]:
     """Runs both commits in turn, prints the table and writes speed_against.json."""
     here = Path(__file__).resolve().parents[1]
     rows = []
@@ -184,6 +183,6 @@ if __name__ == "__main__":
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child:
-        answer()
+        answer(cases())
     else:
-        main(given.out, given.against, given.quick, given.laps, given.case)
+        main(given.out, given.quick, given.against, given.laps, given.case)

@@ -11,6 +11,7 @@ EXPERIMENTS = sorted(path for path in FOLDER.glob("*.py") if not path.name.start
 
 
 SLOW = {  # a minute of compiling each, or what the package's own tests hold anyway
+    "ablation",
     "accuracy",
     "benchmark",
     "benchmark_design",
@@ -23,6 +24,7 @@ SLOW = {  # a minute of compiling each, or what the package's own tests hold any
     "reference_times",
     "riccati_accuracy",
     "sweep_against_measure",
+    "speed_against",
     "start_up",
     "success_table",
     "tune_anywhere",

@@ -81,11 +81,11 @@ def test_the_printed_x_equation_has_two_signs_of_the_opposite_theta():
     for q, v, a in POINTS:
         th, th_dot = q[1], v[1]
         printed = (M + m) * a[0] + m * l * a[1] * np.cos(th) - m * l * th_dot**2 * np.sin(th)
-        mended = (M + m) * a[0] - m * l * a[1] * np.cos(th) + m * l * th_dot**2 * np.sin(th)
+        corrected = (M + m) * a[0] - m * l * a[1] * np.cos(th) + m * l * th_dot**2 * np.sin(th)
         mirrored = generalised_forces(q * [1, -1], v * [1, -1], a * [1, -1])
-        assert generalised_forces(q, v, a)[0] == pytest.approx(mended, rel=1e-11)
+        assert generalised_forces(q, v, a)[0] == pytest.approx(corrected, rel=1e-11)
         assert mirrored[0] == pytest.approx(printed, rel=1e-11)  # right, were the bob at x + l sin(theta)
-        assert abs(printed - mended) > 1e-3
+        assert abs(printed - corrected) > 1e-3
 
 
 def test_the_printed_theta_equation_and_matrix_form_agree_with_the_lagrangian():

@@ -22,7 +22,7 @@ SAMPLED = {"duration": 20.0, "dt": 0.002, "clock": "sampled"}
 
 @pytree
 class SignedSwingUp:
-    """u = +-k E theta' cos(theta) as a voltage, with E or its printed form: the paper's law, mended sign by sign."""
+    """u = +-k E theta' cos(theta) as a voltage, with E or its printed form: the paper's law, corrected sign by sign."""
 
     model: cpjax.CartPole = part("plant", "pendulum_energy")
     outer_sign: Scalar = number("1", "sign of the law")
@@ -99,8 +99,8 @@ def test_the_two_printed_signs_cancel_below_the_energy_of_upright_and_not_above_
 
 
 @both_plants
-@pytest.mark.parametrize("signs", [(-1.0, -1.0), (1.0, 1.0)], ids=["law mended", "energy mended"])
-def test_with_only_one_of_its_signs_mended_the_law_brakes_and_never_gets_there(plant, signs):
+@pytest.mark.parametrize("signs", [(-1.0, -1.0), (1.0, 1.0)], ids=["law corrected", "energy corrected"])
+def test_with_only_one_of_its_signs_corrected_the_law_brakes_and_never_gets_there(plant, signs):
     law = SignedSwingUp(plant, *signs)
     closest, end, _, _ = cpjax.sweep(plant, law, hanging_starts(), metrics=Reach(plant), **SAMPLED)
     assert np.min(closest) > 160.0  # no start swings higher than 162.8 degrees
@@ -118,7 +118,7 @@ def test_the_corrected_law_read_as_a_voltage_never_gets_there(plant, clock):
 
 
 @both_plants
-def test_with_both_signs_mended_but_two_thirds_kept_the_voltage_law_swings_lower_still(plant):
+def test_with_both_signs_corrected_but_two_thirds_kept_the_voltage_law_swings_lower_still(plant):
     law = SignedSwingUp(plant, outer_sign=-1.0, potential_sign=1.0)
     closest, _, _, _ = cpjax.sweep(plant, law, hanging_starts(), metrics=Reach(plant), **SAMPLED)
     assert np.all(np.round(closest) == (93 if plant is APPENDIX else 102))
