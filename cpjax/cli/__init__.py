@@ -1,4 +1,4 @@
-"""The command line. Each command is a file here: it declares options, calls the library, prints and writes."""
+"""The command line: one module per command, which declares options, calls the library, prints and writes."""
 
 import argparse
 import importlib
@@ -22,7 +22,7 @@ exit codes:
   2    bad input, or an output that cannot be written (a full disk): one line on standard error says what is wrong
   130  interrupted
 
-Files are written whatever becomes of standard output. A reader of it that goes away (`cpjax design | head -1`), or a
+Files are written even where standard output fails. A reader of it that stops early (`cpjax design | head -1`), or a
 standard output that is closed, changes no exit code.
 """
 
@@ -46,11 +46,11 @@ _COMMANDS = (
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, wants options in full, and takes `-5e-3` and `-5+2j` for numbers."""
+    """Parser that reports errors in one line, requires full option names, and reads `-5e-3` and `-5+2j` as numbers."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **{"allow_abbrev": False, **options})
-        # argparse's own pattern knows neither exponents nor complex numbers, and there is no public way to change it.
+        # argparse's own pattern matches neither exponents nor complex numbers, and no public name changes it.
         real = r"(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
         self._negative_number_matcher = re.compile(rf"-{real}([-+]{real}[ij]|[ij])?$|-inf$|-nan$")
 
@@ -60,7 +60,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The parser of all commands."""
+    """Builds the parser of all commands."""
     parser = _Parser(
         prog="cpjax",
         description="A motor-driven cart-pole: swing-up, catch, and the numbers behind them.",
@@ -75,7 +75,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def command() -> int:
-    """What the shell calls: `main`, in a process of its own, whose JAX may be set up for the command."""
+    """Runs `main` in a process of its own, whose JAX it sets up, and returns the exit code: the shell's entry point."""
     code = main(set_up=True)
     output.settle()
     if code == INTERRUPTED:
@@ -87,15 +87,16 @@ def main(arguments: Sequence[str] | None = None, *, set_up: bool = False) -> int
     """Runs one command and returns its exit code; see `EXIT_CODES`.
 
     Args:
-      set_up: keep what is compiled for the next process, set up the CPU where the command simulates many starts, and
-        print no warnings of libraries. Only before JAX has started.
+      arguments: those of the command line, the command first; by default the process's.
+      set_up: cache compilations for the next process, configure the CPU if the command simulates many initial states,
+        and print no warnings of libraries. Only before JAX has started.
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
     with output.streams() as out:
         try:
             code = _run(given, set_up)
         except KeyboardInterrupt:
-            if set_up:  # what is left to do takes no time, and a second interrupt would end it with a traceback
+            if set_up:  # the rest is short, and a second interrupt would end it with a traceback
                 signal.signal(signal.SIGINT, signal.SIG_IGN)
             complain(f"cpjax {given[0] if given else ''}: interrupted; what was saved so far is kept")
             code = INTERRUPTED
@@ -113,7 +114,7 @@ def _run(arguments: list[str], set_up: bool) -> int:
             if not text.isascii() and text != text.encode(errors="replace").decode():
                 parser.error(f"argument {text!r}: allowed: text in UTF-8; other could be neither shown nor saved")
         options = parser.parse_args(arguments)
-    except SystemExit as stop:  # argparse ends the process itself; as a function, main returns
+    except SystemExit as stop:  # argparse ends the process; main is a function and returns
         return int(stop.code or 0)
 
     import jax
@@ -126,9 +127,9 @@ def _run(arguments: list[str], set_up: bool) -> int:
         if getattr(options, "many_starts", False):
             runtime.configure_cpu()
         startup.ready()  # until here an interrupt ends the process at once: nothing has been written
-        if not sys.warnoptions:  # what matters of them is in the results, as a flag, or in an error
+        if not sys.warnoptions:  # those that matter are in the results, as a flag, or in an error
             warnings.simplefilter("ignore")
-    # The protocol's figures are float64. Set here, in the application: the library never touches JAX's settings.
+    # The protocol's figures are float64. Set here, in the application: the library never changes this setting.
     jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # JAX has no annotations for it
     try:
         with np.errstate(all="ignore"):  # an overflow shows in the result, or in the one line of an error
@@ -137,7 +138,7 @@ def _run(arguments: list[str], set_up: bool) -> int:
     except InputError as problem:
         complain(f"cpjax {options.command}: error: {problem}")
         return 2
-    except OSError as problem:  # a name too long, a disk that is full: what libraries have no better words for
+    except OSError as problem:  # such as a full disk or a name too long, which no InputError reports
         if problem.errno is None:
             raise
         allowed = f"a place that can be read and written ({problem.strerror})"

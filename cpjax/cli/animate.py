@@ -1,4 +1,4 @@
-"""`cpjax animate`: one run, or several side by side, as a moving picture."""
+"""`cpjax animate`: an animation of one run, or of several side by side."""
 
 import argparse
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ from cpjax.plant.state import State
 from cpjax.sim.rollout import Trajectory, rollout
 
 CONTROLLERS = ("corrected/lqr", "tuned_lqr")
-_AFTER = 1.0  # seconds: who settles holds so long
+_AFTER = 1.0  # simulated beyond the shown time [s]: success must hold that long
 FORMATS = ("gif", "mp4", "html")
 
 OPTIONS = [
@@ -86,8 +86,16 @@ def animated(
     chosen: Mapping[str, Any],
     **others: Any,
 ) -> tuple[Path, dict[str, Trajectory]]:
-    """The animation's file and the runs it shows, written with animation.json; `chosen` has format, duration and rate,
-    and the JSON has `others` too.
+    """Simulates the controllers and writes the animation and animation.json.
+
+    Args:
+      controllers: by the names that `controller_title` puts into words.
+      start: the initial state of all runs.
+      chosen: format (gif, mp4 or html), duration [s] and rate [pictures/s].
+      others: further entries of the JSON.
+
+    Returns:
+      The animation's file, and the runs by name.
     """
     dt = 0.002  # divides _AFTER
     duration = dt * round(chosen["duration"] / dt)
@@ -138,14 +146,14 @@ def animated(
 
 
 def verdict(run: Trajectory, duration: float) -> str:
-    """Whether a run that lasts a second longer than is shown settles in the time that is."""
+    """Says whether a run, simulated a second longer than shown, settles within the shown `duration` [s]."""
     time = float(run.metrics.settling_time)
     settled = bool(run.metrics.success) and time <= duration
     return f"settles after {time:.2f} s" if settled else f"does not settle in {duration:g} s"
 
 
 def _colour(name: str, controller: Hybrid) -> str:
-    """Its design's; a gain without one is known by its name."""
+    """Returns the colour of the controller's design; of a gain without a design, by the controller's name."""
     from cpjax.show.figures import DESIGN_COLOURS, design_colour
 
     return DESIGN_COLOURS["placement"] if "/placement" in name else design_colour(controller)

@@ -61,12 +61,12 @@ def run(given: argparse.Namespace) -> int:
 
 
 def print_audit(audit: GainAudit, plant: Any) -> None:
-    """The tables for people."""
+    """Prints the tables of fits and of combinations of parameters."""
     from cpjax.show.gain_identification import DIRECTION_HEADER, FIT_HEADER, direction_cells, fit_cells, shown_fits
 
     title = "Residuals in units of the last printed digit"
     print_table(title, FIT_HEADER, [fit_cells(fit, plant) for fit in shown_fits(audit)], text_columns=2)
-    title = "Combinations that the gains know, at the best of these plants"
+    title = "Combinations of parameters that the gains depend on, at the best of these plants"
     known = [direction_cells(d) for d in audit.directions if d.sensitivity > 0.0]
     print_table(title, DIRECTION_HEADER, known, text_columns=1)
 

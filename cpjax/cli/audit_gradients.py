@@ -1,4 +1,4 @@
-"""`cpjax audit-gradients`: can gradients through this loop be trusted? A table, a picture and JSON."""
+"""`cpjax audit-gradients`: which gradients through the loop can be trusted, as a table, a picture and JSON."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -72,7 +72,13 @@ def run(given: argparse.Namespace) -> int:
 def audited(
     out: Path, plant: CartPole, controller: Hybrid, setting: Mapping[str, Any], seed: int, notes: Sequence[str] = ()
 ) -> GradientAudit:
-    """The audit, with its JSON and picture written; `setting` is by the options' keys, what is missing by default."""
+    """Runs the audit and writes its JSON and picture.
+
+    Args:
+      setting: starts, count, duration [s] and dt [s]; missing ones have the options' defaults.
+      seed: of the initial states.
+      notes: for the JSON.
+    """
     setting = {"starts": "hanging", "count": 16, "duration": 4.0, "dt": 1e-3, **setting}
     starts = sample_starts(setting["starts"], setting["count"], seed=seed)
     chosen = parametrise(plant, controller)

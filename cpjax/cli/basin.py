@@ -1,4 +1,4 @@
-"""`cpjax basin`: where controllers work, as maps, JSON and files of all runs."""
+"""`cpjax basin`: basins of attraction of controllers, as maps, JSON and files of all runs."""
 
 import argparse
 import dataclasses
@@ -25,7 +25,7 @@ from cpjax.study.basin import MOST_CELLS, Axis, StartGrid, area, document
 from cpjax.study.design_check import DesignCheck, check_design
 from cpjax.study.recording import read_sweep, record_sweep
 
-if TYPE_CHECKING:  # matplotlib takes a while; bad input should not wait for it
+if TYPE_CHECKING:  # importing matplotlib is slow; bad input should fail before it
     from cpjax.show.basin import Panel
 
 CONTROLLERS = ("corrected/lqr", "corrected/placement", "tuned_lqr", "tuned_place")
@@ -102,8 +102,19 @@ def drawn(
     setting: dict[str, Any],
     notes: Sequence[str] = (),
 ) -> dict[str, dict[str, Any]]:
-    """The maps of all controllers in a few numbers, with basin.json, basin.png and their runs written when all are
-    done. Until then everything is in the folder `parts`, and what an earlier map left in `out` stays as it is.
+    """Maps all controllers and, when all are done, writes basin.json, basin.png and their runs.
+
+    Until then all results are in the folder `parts`, from where an interrupted map goes on, and the files of an earlier
+    map in `out` stay as they are.
+
+    Args:
+      controllers: by the names that `controller_title` puts into words.
+      chart: the grid of initial states.
+      setting: duration and dt [s].
+      notes: for the JSON.
+
+    Returns:
+      Each controller's map in a few numbers, by name.
     """
     request = {
         "what": "share of a map from which controllers settle: sampled, not certified",
@@ -131,7 +142,15 @@ def drawn(
 
 
 def chart_of(chosen: dict[str, Any], seed: int) -> StartGrid:
-    """The map that the options describe."""
+    """Builds the grid of initial states that the options describe.
+
+    Args:
+      chosen: the values of the section "map".
+      seed: of the initial states.
+
+    Raises:
+      InputError: a number of cells or a range that is not allowed.
+    """
 
     cells = chosen.get("cells", 512)
     if not 2 <= cells <= MOST_CELLS:
@@ -149,14 +168,14 @@ def chart_of(chosen: dict[str, Any], seed: int) -> StartGrid:
 
 
 def file_of(name: str) -> str:
-    """Of a controller's runs."""
+    """Returns the name of the file with a controller's runs."""
     return name.replace("/", "-").removesuffix(".json").removesuffix(".toml").lstrip(".-") + ".npz"
 
 
 def mapped(
     parts: Path, plant: CartPole, chart: StartGrid, name: str, controller: Hybrid, setting: dict[str, Any]
 ) -> Metrics:
-    """The metrics of a controller's map, recorded in `parts`, or from there where they are complete."""
+    """Returns the metrics of a controller's map, recorded in `parts` or, if complete there, read from it."""
     path = parts / file_of(name)
     if path.exists():
         columns: dict[str, Any] = read_sweep(path)[1]
@@ -176,7 +195,7 @@ def mapped(
 
 
 def panel_of(plant: CartPole, chart: StartGrid, name: str, controller: Hybrid, metrics: Metrics) -> "Panel":
-    """What the picture needs of one controller."""
+    """Returns one controller's panel of the picture."""
     from cpjax.show.basin import Panel
 
     found = area(chart, np.asarray(metrics.success))
@@ -199,7 +218,7 @@ def _checked(plant: CartPole, controller: Hybrid) -> DesignCheck | None:
 
 
 def table(rows: Mapping[str, dict[str, Any]]) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
-    """Title, header and cells, for people."""
+    """Returns title, header and cells of the printed table, from the numbers of each map by controller."""
 
     def text(value: float | None) -> str:
         return "-" if value is None else f"{value:.3g}"

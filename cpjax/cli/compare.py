@@ -69,8 +69,15 @@ def compared(
     track_limit: float = float("inf"),
     notes: Sequence[str] = (),
 ) -> tuple[list[Compared], str]:
-    """The comparison, with its JSON and pictures written, and which start the pictures of one run show; `tuned` is by
-    design, what is missing from the presets.
+    """Runs the comparison and writes its JSON and pictures.
+
+    Args:
+      tuned: by design; the presets where it has none.
+      track_limit: a run that leaves |x| <= track_limit [m] fails.
+      notes: for the JSON.
+
+    Returns:
+      The results, and in words which initial state the pictures of one run show.
     """
     chosen = entries(plant, tuned)
     with progress("compare") as report:
@@ -100,17 +107,22 @@ def compared(
 
 
 def representative_start(starts: State, shown: Sequence[Compared]) -> tuple[State, str]:
-    """The first start that all of these catch, or else the first one; and which of the two it is."""
+    """Returns the first initial state that all shown controllers catch, or else the first one; and in words which.
+
+    Args:
+      starts: of arrays (n,).
+      shown: with metrics of arrays (n,).
+    """
     caught = np.all([np.asarray(one.metrics.success) for one in shown], axis=0)
     index = int(np.argmax(caught))
     start = State(*(float(np.asarray(getattr(starts, name))[index]) for name in NAMES))
     if not caught[index]:
-        return start, f"the first of {len(caught)}: no start is caught by all that are shown"
-    return start, f"number {index + 1} of {len(caught)}, the first that all catch that are shown"
+        return start, f"the first of {len(caught)}: no start is caught by all shown controllers"
+    return start, f"number {index + 1} of {len(caught)}, the first that all shown controllers catch"
 
 
 def print_results(results: list[Compared]) -> None:
-    """The table for people."""
+    """Prints the table."""
     from cpjax.show.comparison import HEADER, cells
 
     print_table("Means over the successful runs", HEADER, map(cells, results), text_columns=3)

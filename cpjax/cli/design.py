@@ -1,4 +1,4 @@
-"""`cpjax design`: a regulator on a plant, checked, as a table, a picture and JSON."""
+"""`cpjax design`: the checks of a regulator on a plant, as a table, a picture and JSON."""
 
 import argparse
 from typing import Any
@@ -19,7 +19,7 @@ def add_command(commands: Any) -> None:
         "Computes or takes a regulator's gain and checks it on the plant's linear model: poles, margins, the voltage "
         "that it asks for, and the region in which it needs neither clip nor gate. Writes design.json and design.png."
     )
-    parser = commands.add_parser("design", help="a regulator's gain and what it is worth", description=text)
+    parser = commands.add_parser("design", help="a regulator's gain and its checks", description=text)
     add_options(parser, OPTIONS, out="out/design")
     parser.set_defaults(run=run)
 

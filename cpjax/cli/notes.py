@@ -1,4 +1,4 @@
-"""What a person should know about what was given, and may not see: one line each, on standard error and in the JSON."""
+"""Notes on inputs with consequences that are easy to miss: one line each, on standard error and in the JSON."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,17 +16,17 @@ from cpjax.pytree import Number, rules
 
 _MOTOR = {key: rule for key, rule in rules(Motor).items() if isinstance(rule, Number)}
 _SUPPLY = "voltage_limit"
-"""Of the motor's fields the one that is no property of the motor; no linear model knows it."""
+"""The field of `Motor` that is no property of the motor itself; linear models do not depend on it."""
 
 
 def announce(command: str, notes: Sequence[str]) -> None:
-    """Prints the notes."""
+    """Prints the notes on standard error."""
     for note in notes:
         complain(f"cpjax {command}: note: {note}")
 
 
 def notes_on(given: Mapping[str, Any], plant: CartPole, controllers: Mapping[str, Any] | None = None) -> list[str]:
-    """All notes on a plant that was built from the options `given`, and on controllers, by their names, that run it."""
+    """Returns all notes on a plant that was built from the options `given`, and on its controllers by name."""
     found = plant_notes(given, plant)
     for name, controller in (controllers or {}).items():
         found += controller_notes(name, controller, plant)
@@ -34,7 +34,7 @@ def notes_on(given: Mapping[str, Any], plant: CartPole, controllers: Mapping[str
 
 
 def plant_notes(given: Mapping[str, Any], plant: CartPole) -> list[str]:
-    """Which fields of a motor that was given in part have values that nobody gave."""
+    """Returns a note with the fields that were left at their defaults, if a motor was given in part."""
     base = given.get("base", "appendix")
     stated = {key for key in _MOTOR if key in given}
     whose = f"the {base} plant's"
@@ -45,7 +45,7 @@ def plant_notes(given: Mapping[str, Any], plant: CartPole) -> list[str]:
         stated |= set(motor) & set(_MOTOR)
         whose = "the paper's"
         if not stated:
-            stated = {""}  # of a plant that leaves out its motor, all of it is worth a line
+            stated = {""}  # a plant without a motor: the note lists all of its fields
     left = [key for key in _MOTOR if key not in stated]
     if not stated - {_SUPPLY} or not set(left) - {_SUPPLY}:
         return []
@@ -58,7 +58,7 @@ def plant_notes(given: Mapping[str, Any], plant: CartPole) -> list[str]:
 
 
 def controller_notes(name: str, controller: Any, plant: CartPole) -> list[str]:
-    """That a controller was made for another plant, or that its regulator does not hold this one."""
+    """Returns notes on a controller made for another plant, or with a regulator that does not stabilise this one."""
     found = []
     others = model_differences(controller, plant)
     if others:
@@ -78,7 +78,7 @@ def controller_notes(name: str, controller: Any, plant: CartPole) -> list[str]:
 
 
 def papers_own(plant: CartPole) -> str | None:
-    """Which of the paper's plants this is, whatever its supply; None if it is another."""
+    """Returns the name of the paper's plant that this is, with any supply; None if it is another plant."""
     for name, make in paper.PLANTS.items():
         if set(differences(make(), plant)) <= {_SUPPLY}:
             return name
@@ -86,18 +86,18 @@ def papers_own(plant: CartPole) -> str | None:
 
 
 def unstable_pole(plant: CartPole, regulator: StateFeedback) -> complex | None:
-    """The pole of the linear closed loop, upright, that grows fastest [1/s]; None if none does.
+    """Returns the unstable pole of the linear closed loop about upright that grows fastest [1/s]; None if it is stable.
 
-    Without JAX, whose compilations would take a second.
+    It is computed without JAX, whose compilations would take a second.
     """
     A, B = np.zeros((4, 4)), np.zeros((4, 1))
     A[0, 1] = A[2, 3] = 1.0
 
     motor: Any = plant.motor
-    body: Any = plant  # with complex numbers, which the annotations do not know
+    body: Any = plant  # called with complex numbers, which its annotations exclude
 
     def slope(sin: Any = 0.0, x_dot: Any = 0.0, theta_dot: Any = 0.0, voltage: Any = 0.0) -> tuple[float, float]:
-        """Accelerations per so much of one of these: by a step in the imaginary direction, which rounds nothing off."""
+        """Returns the derivatives of the accelerations by one argument: by a complex step, without cancellation."""
         force = motor.force(voltage, x_dot)
         x_ddot, theta_ddot = body.acceleration(sin, 1.0, (x_dot, theta_dot), force)
         return float(np.imag(x_ddot)) / _STEP, float(np.imag(theta_ddot)) / _STEP
@@ -109,10 +109,10 @@ def unstable_pole(plant: CartPole, regulator: StateFeedback) -> complex | None:
             A[[1, 3], 3], B[[1, 3], 0] = slope(theta_dot=step), slope(voltage=step)
             loop = A - B @ np.asarray(regulator.K, dtype=float)
             poles = np.linalg.eigvals(loop)
-        except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError):  # batches and overflows: others' matter
+        except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError):  # batches and overflows get no note
             return None
     worst = complex(poles[np.argmax(poles.real)])
-    # A pole at zero, of a cart that nothing centres, comes out as rounding noise of the matrix.
+    # A pole at zero, of a cart without feedback of x, is computed as rounding noise of the matrix.
     return worst if worst.real > 1e-9 * max(1.0, float(np.max(np.abs(loop)))) and math.isfinite(worst.real) else None
 
 
@@ -120,5 +120,5 @@ _STEP = 1e-20
 
 
 def shown_pole(pole: complex) -> str:
-    """A pole for people."""
+    """Returns a pole as text with its unit."""
     return f"{pole.real:.3g}{pole.imag:+.3g}i 1/s" if pole.imag else f"{pole.real:.3g} 1/s"

@@ -1,6 +1,6 @@
-"""Options that a flag or a TOML file can set, and what is built from them.
+"""Options that a flag or a TOML file can set, and the plants, controllers and initial states built from them.
 
-One declaration makes both: section "plant", key "cart_mass" is `--cart-mass` on the command line and `cart_mass` under
+One declaration serves both: section "plant", key "cart_mass" is `--cart-mass` on the command line and `cart_mass` under
 `[plant]` in the file given with `--config`. A flag wins over the file. Names, units and ranges of physical parameters
 come from the fields of the classes themselves.
 """
@@ -39,15 +39,15 @@ from cpjax.presets import PRESETS, preset
 from cpjax.pytree import Number, rules
 from cpjax.sim.integrators import INTEGRATORS
 
-_LONG_NAME = 48  # more letters of a file's name have no place above a picture
+_LONG_NAME = 48  # characters of a file's name that fit above a picture
 
 Sections: TypeAlias = Mapping[str, Mapping[str, Any]]
-"""Values given by the user, by section and key. What was not given is absent."""
+"""Values given by the user, by section and key. Those not given are absent."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """One setting; `flag` where it differs from the key."""
+    """One option; `flag` where it differs from the key."""
 
     section: str
     key: str
@@ -55,7 +55,7 @@ class Option:
     type: type = str
     choices: Sequence[str] | None = None
     count: int | tuple[int, int] | Literal["+"] | None = None
-    """How many values; "+" for one or more; of two numbers either."""
+    """Number of values; "+" for one or more; a pair of numbers for either of the two."""
     flag: str | None = None
     numbers: bool = False
     """Whether a file may give a text as a number, or as a pair of real and imaginary part."""
@@ -67,7 +67,7 @@ class Option:
 
 
 def numbers_of(section: str, cls: type, keys: Sequence[str] | None = None) -> list[Option]:
-    """An option for each number of a class, or for those named."""
+    """Returns an option for each number of a class, or for those named in `keys`."""
     chosen = {k: r for k, r in rules(cls).items() if isinstance(r, Number) and (keys is None or k in keys)}
     return [Option(section, key, f"{rule.help} [{rule.unit}]", float) for key, rule in chosen.items()]
 
@@ -146,7 +146,11 @@ EVALUATION_OPTIONS = [
 
 
 def add_options(parser: argparse.ArgumentParser, options: Sequence[Option], *, out: str) -> None:
-    """Declares the options, grouped by section, and those that every command has."""
+    """Declares the options, grouped by section, and those that every command has.
+
+    Args:
+      out: the default of --out.
+    """
     parser.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file, in sections; flags win")
     parser.add_argument("--seed", type=int, default=1, help="of everything random (default 1)")
     parser.add_argument("--out", type=Path, default=Path(out), help=f"folder for what is written (default {out})")
@@ -166,7 +170,7 @@ def add_options(parser: argparse.ArgumentParser, options: Sequence[Option], *, o
 
 
 def _one_of(counts: tuple[int, int]) -> type[argparse.Action]:
-    """Stores so many values, or so many."""
+    """Returns an action that stores as many values as one of the two counts."""
 
     class Store(argparse.Action):
         def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
@@ -178,7 +182,7 @@ def _one_of(counts: tuple[int, int]) -> type[argparse.Action]:
 
 
 def resolve(given: argparse.Namespace, options: Sequence[Option]) -> Sections:
-    """What the file and the flags say together.
+    """Returns the values of the file and of the flags; flags win.
 
     Raises:
       InputError: a file that is no TOML, or a section, key or value in it that no option has.
@@ -217,7 +221,7 @@ def _read_config(path: Path, options: Sequence[Option], sections: dict[str, dict
 
 
 def _checked_value(field: str, value: Any, option: Option) -> Any:
-    """A value from a file, held to what the flag would have accepted."""
+    """Returns a value from a file as the flag would have been given it, checked as the flag's would be."""
     kinds = {float: ((int, float), "a number"), int: ((int,), "a whole number"), str: ((str,), "a text")}
     python_types, words = kinds[option.type]
     several = option.count is not None
@@ -243,7 +247,7 @@ def _checked_value(field: str, value: Any, option: Option) -> Any:
 
 
 def _complex_text(value: Any) -> Any:
-    """A number, or a pair of real and imaginary part, as the text that the flag would have been given."""
+    """Returns a number, or a pair of real and imaginary part, as text for the flag; other values unchanged."""
     parts = value if isinstance(value, list) and len(value) == 2 else [value]
     if any(isinstance(one, bool) or not isinstance(one, (int, float)) for one in parts):
         return value
@@ -251,7 +255,14 @@ def _complex_text(value: Any) -> Any:
 
 
 def build_plant(given: Mapping[str, Any]) -> CartPole:
-    """The base plant with the given parameters changed."""
+    """Builds the base plant with the given parameters changed.
+
+    Args:
+      given: the values of the section "plant".
+
+    Raises:
+      InputError: a base that is neither one of the paper's nor a file with a CartPole, or a value outside its range.
+    """
     changes = dict(given)
     base = changes.pop("base", "appendix")
     if base in paper.PLANTS:
@@ -266,7 +277,16 @@ def build_plant(given: Mapping[str, Any]) -> CartPole:
 
 
 def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
-    """The hybrid controller that the options describe, with `plant` as its law's model; or the one in the file."""
+    """Builds the hybrid controller that the options describe, or loads the one in the file.
+
+    Args:
+      given: the values of the section "controller".
+      plant: the model of the swing-up law, and the plant for which gains are computed.
+
+    Raises:
+      InputError: options that are missing, exclude each other or do not belong to the chosen law or gate, a value
+        outside its range, or a gain that cannot be computed.
+    """
     changes = dict(given)
     file = changes.pop("file", None)
     if file is not None:
@@ -274,7 +294,7 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
             raise InputError("controller", file, "alone, without " + ", ".join(changes))
         return saved_controller(file)
     name = changes.pop("law", "corrected-centred")
-    law: Any = paper.LAWS[name](plant)  # a dataclass, which the protocol that annotates it does not say
+    law: Any = paper.LAWS[name](plant)  # a dataclass, which its protocol does not express
     law_changes = {key: changes.pop(key) for key in list(changes) if key in rules(EnergySwingUp)}
     for key in law_changes:
         if key not in rules(type(law)):
@@ -288,7 +308,15 @@ def build_controller(given: Mapping[str, Any], plant: CartPole) -> Controller:
 
 
 def saved_controller(name: str, also: str = "") -> Controller:
-    """The preset of this name, or what the file of this name holds; `also` is what else is allowed, in words."""
+    """Loads the preset or the file of this name.
+
+    Args:
+      name: a preset's, or a file's that ends in .json or .toml.
+      also: what else is allowed, in words for the error.
+
+    Raises:
+      InputError: another name, or a file without a controller or law.
+    """
     for design, known in PRESETS.items():
         if name == known:
             return preset(design)
@@ -299,7 +327,14 @@ def saved_controller(name: str, also: str = "") -> Controller:
 
 
 def saved(path: str, field: str) -> Controller:
-    """The controller in a file, or in a result that a command wrote; `field` is what the error names."""
+    """Loads the controller in a file, or in a result that a command wrote.
+
+    Args:
+      field: the name of the option, for the error.
+
+    Raises:
+      InputError: a file without a controller or law.
+    """
     wanted = "a controller or a law"
     loaded = io.load_part(path, "controller", wanted)
     try:
@@ -310,7 +345,14 @@ def saved(path: str, field: str) -> Controller:
 
 
 def named_hybrid(name: str, plant: CartPole) -> Hybrid:
-    """A controller in one word: a preset, a file, or the paper's LAW/DESIGN or LAW/DESIGN/GAINS."""
+    """Builds a controller from one word: a preset, a file, or the paper's LAW/DESIGN or LAW/DESIGN/GAINS.
+
+    Args:
+      plant: the model of the paper's laws, and the plant for which gains are computed.
+
+    Raises:
+      InputError: another name, or a file without a Hybrid.
+    """
     law, *others = name.split("/")
     if law in paper.LAWS and Path(name).suffix.lower() not in (".json", ".toml"):
         for design, gains in itertools.product(get_args(paper.Design), get_args(paper.Gains)):
@@ -325,10 +367,10 @@ def named_hybrid(name: str, plant: CartPole) -> Hybrid:
 
 
 def controller_title(name: str) -> str:
-    """What `named_hybrid` takes, in words for people."""
+    """Returns a name that `named_hybrid` takes as words for tables and figures."""
     law, *others = name.split("/")
     if law in paper.LAWS and others:
-        from cpjax.show.figures import DESIGN_NAMES  # matplotlib takes a while; parsing options should not wait for it
+        from cpjax.show.figures import DESIGN_NAMES  # importing matplotlib is slow; parsing needs none
 
         rest = (DESIGN_NAMES.get(one, f"{one} gains") for one in others)
         return ", ".join([f"paper, {law.replace('-', ' ')}", *rest])
@@ -337,7 +379,11 @@ def controller_title(name: str) -> str:
 
 
 def build_hybrid(given: Mapping[str, Any], plant: CartPole) -> Hybrid:
-    """As `build_controller`, for commands that need a regulator behind a gate."""
+    """Builds a controller as `build_controller` does, for commands that need a regulator behind a gate.
+
+    Raises:
+      InputError: as there, or a file without a Hybrid.
+    """
     controller = build_controller(given, plant)
     if not isinstance(controller, Hybrid):
         raise InputError("controller", type(controller).__name__, "a Hybrid: a regulator behind a gate")
@@ -366,7 +412,7 @@ def _build_regulator(changes: dict[str, Any], plant: CartPole, reference: State)
         if "poles" in given:
             poles = parse_poles(given["poles"])
             K = _designed("gain", plant, lambda A, B: place(A, B, poles))
-            stable = all(pole.real < 0.0 for pole in poles)  # others are no design that could be tuned
+            stable = all(pole.real < 0.0 for pole in poles)  # unstable poles are no design that can be tuned
             return StateFeedback(K, reference, PoleFactors.from_poles(poles) if stable else None)
         Q, R = _weights(weights)
         K = _designed("gain", plant, lambda A, B: lqr(A, B, Q, R).K)
@@ -383,12 +429,12 @@ def _build_regulator(changes: dict[str, Any], plant: CartPole, reference: State)
 
 
 def default_gains(plant: CartPole) -> paper.Gains:
-    """The printed ones for the paper's own plants; what they would do on any other is nobody's question."""
+    """Returns "printed" for the paper's own plants, for which those gains are meant, and else "computed"."""
     return "computed" if papers_own(plant) is None else "printed"
 
 
 def _designed(what: str, plant: CartPole, design: Callable[[Any, Any], Any]) -> Any:
-    """What `design` makes of the linear model; if that is impossible, it is the plant's fault as well."""
+    """Applies `design` to the linear model (A, B); if that is impossible, the error names the plant."""
     try:
         return design(*linearize(plant))
     except (InputError, np.linalg.LinAlgError) as problem:
@@ -406,7 +452,7 @@ def _weights(given: Mapping[str, Any]) -> tuple[np.ndarray[Any, Any], list[list[
 
 
 def parse_poles(texts: Sequence[str]) -> list[complex]:
-    """Poles as a person writes them: -3, -5+2j, or with i for j.
+    """Parses poles [1/s] written as -3, -5+2j, or with i for j.
 
     Raises:
       InputError: one that is no number.
@@ -436,7 +482,11 @@ def _build_gate(changes: dict[str, Any], plant: CartPole, reference: State, weig
 
 
 def build_start(given: Mapping[str, Any], seed: int) -> State:
-    """One start: drawn from the set, then the given components changed."""
+    """Builds one initial state: drawn from a set, then the given components changed.
+
+    Args:
+      given: the values of the section "start".
+    """
     changes = dict(given)
     drawn = sample_starts(changes.pop("set", "rest"), 1, seed=seed)
     return State(**{name: float(changes.get(name, getattr(drawn, name)[0])) for name in NAMES})

@@ -1,4 +1,4 @@
-"""Standard output and standard error, as a command needs them: what cannot be printed never stops what it computes."""
+"""Standard output and standard error of a command: a failure to print never stops the computation."""
 
 import contextlib
 import io
@@ -11,10 +11,10 @@ from cpjax.errors import one_line, printable
 
 
 class Stream(io.TextIOBase):
-    """Prints to another stream as long as that works; from the first failure on, to nowhere.
+    """Stream that prints to another one and discards all text after the first failure.
 
-    Characters that its encoding lacks are printed as escapes. A reader that went away (`cpjax design | head -1`) has
-    what it wanted, and a stream that was closed from the start was not wanted; anything else is a `problem`.
+    Characters that the other's encoding lacks are printed as escapes. A reader that stopped early (`cpjax design |
+    head -1`) and a closed stream are no errors; any other failure is stored in `problem`.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -24,17 +24,17 @@ class Stream(io.TextIOBase):
 
     @property
     def encoding(self) -> str:  # type: ignore[override]  # a plain attribute there
-        """The other stream's."""
+        """The encoding of the other stream."""
         return getattr(self._stream, "encoding", None) or "utf-8"
 
     def write(self, text: str) -> int:
-        """Prints, if it can."""
+        """Prints the text unless the stream has failed; returns its length."""
         shown = text.encode(self.encoding, errors="backslashreplace").decode(self.encoding)
         self._try("write", shown)
         return len(text)
 
     def flush(self) -> None:
-        """Prints what waits to be, if it can."""
+        """Flushes the other stream unless it has failed."""
         self._try("flush")
 
     def writable(self) -> bool:
@@ -58,13 +58,13 @@ class Stream(io.TextIOBase):
         except OSError as problem:
             self.problem = problem
             self._open = False
-        except ValueError:  # closed by somebody else
+        except ValueError:  # the stream is closed
             self._open = False
 
 
 @contextlib.contextmanager
 def streams() -> Iterator[Stream]:
-    """Both standard streams as a `Stream` meanwhile; yields that of standard output."""
+    """Replaces both standard streams by a `Stream` within the context; yields that of standard output."""
     out, err = Stream(sys.stdout), Stream(sys.stderr)
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
@@ -75,9 +75,9 @@ def streams() -> Iterator[Stream]:
 
 
 def settle() -> None:
-    """Sees that Python, which flushes both streams once more at its exit, does not fail at what could not be printed.
+    """Flushes both standard streams and redirects one that fails to the null device.
 
-    For a process that ends: what waits to be printed to a broken stream goes nowhere.
+    For a process that ends: Python flushes both once more at its exit, and would fail on text that cannot be printed.
     """
     for stream in (sys.stdout, sys.stderr):
         try:
@@ -87,16 +87,16 @@ def settle() -> None:
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, stream.fileno())
             os.close(nowhere)
-        except ValueError:  # it is closed, and will not be flushed
+        except ValueError:  # it is closed, and Python will not flush it
             pass
 
 
 def say(*lines: str) -> None:
-    """Lines on standard output, with nothing in them that controls a terminal."""
+    """Prints lines on standard output, with characters that control a terminal escaped."""
     for line in lines:
         print(printable(line))
 
 
 def complain(text: str) -> None:
-    """One line on standard error."""
+    """Prints one line on standard error."""
     print(one_line(text), file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""`cpjax pareto`: what settling faster costs, by LQR and by pole placement, as fronts."""
+"""`cpjax pareto`: trade-off fronts of settling time against cost, for LQR and for pole placement."""
 
 import argparse
 import dataclasses
@@ -20,7 +20,7 @@ from cpjax.paper.reproduction import DESIGNS, EvaluationConfig
 from cpjax.plant import CartPole
 from cpjax.study.fronts.config import COSTS, FrontConfig
 
-if TYPE_CHECKING:  # imports of it take a while
+if TYPE_CHECKING:  # slow to import
     from cpjax.show.front import Curve
     from cpjax.study.fronts.reference_point import ReferencePoints
 
@@ -89,8 +89,12 @@ def run(given: argparse.Namespace) -> int:
 def made(
     out: Path, parts: Path, plant: CartPole, plan: FrontConfig, supplies: tuple[float, ...], notes: Sequence[str] = ()
 ) -> Found:
-    """The fronts of both designs, with pareto.json, pareto.png and supplies.png written; until then what is done is in
-    the folder `parts`.
+    """Traces the fronts of both designs and writes pareto.json, pareto.png and supplies.png.
+
+    Args:
+      parts: folder of finished searches, from which an interrupted run goes on; removed at the end.
+      supplies: further voltage limits for settling time against effort [V].
+      notes: for the JSON.
     """
     from cpjax.study.fronts.reference_point import reference_points
 
@@ -114,7 +118,7 @@ def made(
 
 
 def known_controllers(plant: CartPole, plan: FrontConfig) -> list[tuple[str, Compared]]:
-    """The paper's printed gains and the controllers that come with cpjax, from the starts that measure the points."""
+    """Evaluates the paper's printed gains and cpjax's presets from the initial states that measure the points."""
     from cpjax.study.fronts.evaluator import FINAL
     from cpjax.tune.descent import derive_seed
 
@@ -136,12 +140,12 @@ def traced(
     supplies: tuple[float, ...],
     measure: "ReferencePoints",
 ) -> dict[str, Any]:
-    """A design's fronts as plain values, kept in `folder`, from where an interrupted run goes on."""
+    """Traces a design's fronts, saved in `folder`, from where an interrupted run goes on; returns plain values."""
     path = folder / "fronts.json"
     if path.exists():
         return io.read_table(path)
 
-    from cpjax.study.fronts.trace import trace_fronts  # optax takes a while; other commands should not wait for it
+    from cpjax.study.fronts.trace import trace_fronts  # imports optax, which is slow; other commands need none
 
     with progress(f"pareto, {design}") as report:
         fronts = trace_fronts(
@@ -179,7 +183,7 @@ def traced(
 
 
 def draw(out: Path, plant: CartPole, found: Found, controllers: list[tuple[str, Compared]]) -> None:
-    """The pictures."""
+    """Draws and writes pareto.png and supplies.png."""
     from cpjax.show.figures import png
     from cpjax.show.front import Known, by_supply, fronts
 
@@ -206,7 +210,7 @@ def draw(out: Path, plant: CartPole, found: Found, controllers: list[tuple[str, 
 
 
 def curves_of(found: Found) -> "dict[tuple[float, str], dict[str, Curve]]":
-    """Fronts by supply and cost, and by design."""
+    """Returns the fronts by (supply [V], cost) and design."""
     from cpjax.show.front import Curve
 
     curves: dict[tuple[float, str], dict[str, Curve]] = {}
@@ -219,7 +223,7 @@ def curves_of(found: Found) -> "dict[tuple[float, str], dict[str, Curve]]":
 
 
 def table(found: Found) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
-    """Title, header and cells, for people."""
+    """Returns title, header and cells of the printed table."""
     header = ("regulator", "cost", "supply [V]", "points", "fastest [s]", "cheapest", "hypervolume", "of random search")
     cells: list[tuple[str, ...]] = [
         (
@@ -239,7 +243,7 @@ def table(found: Found) -> tuple[str, tuple[str, ...], list[tuple[str, ...]]]:
 
 
 def costs(found: Found) -> list[str]:
-    """What each design's search took, in words."""
+    """Returns one sentence per design with the steps and the time of its search."""
     sentences = []
     for design in DESIGNS:
         total = {kind: sum(one[kind] for one in found[design]["steps"]) for kind in ("values", "gradients", "random")}
@@ -252,5 +256,5 @@ def costs(found: Found) -> list[str]:
 
 
 def _none(front: dict[str, Any]) -> str:
-    """Instead of a number of points."""
+    """Returns the text in place of the number of points of an empty front."""
     return f"none (the best settles from {100 * front['best_success']:.1f} %)"

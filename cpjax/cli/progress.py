@@ -1,4 +1,4 @@
-"""Progress for people, on standard error: a bar on a terminal, a line per step elsewhere."""
+"""Progress on standard error: a bar on a terminal, a line per step elsewhere."""
 
 import contextlib
 import sys
@@ -12,7 +12,7 @@ from cpjax.cli.output import complain
 from cpjax.errors import printable
 
 Report: TypeAlias = Callable[[int, int, str], None]
-"""Takes how much is done, of how much, and what comes next."""
+"""Takes the amount done, the total amount, and in words what comes next."""
 
 
 @contextlib.contextmanager
@@ -31,9 +31,9 @@ def progress(what: str) -> Iterator[Report]:
 
 
 def compiling(report: Report, before: str) -> Report:
-    """The same, and the first text that begins with `before` says that a compilation comes first, which says nothing.
+    """Returns `report` with a notice of a compilation in the first text that begins with `before`.
 
-    Of a gradient it takes a minute or more, unless an earlier process has kept what it compiled.
+    The compilation reports no progress. That of a gradient takes a minute or more, unless an earlier process cached it.
     """
     told = False
 

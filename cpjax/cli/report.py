@@ -1,4 +1,4 @@
-"""`cpjax report`: the main job, as one self-contained HTML page."""
+"""`cpjax report`: the reproduction, the audits and the studies as one self-contained HTML page."""
 
 import argparse
 import dataclasses
@@ -55,10 +55,17 @@ def run(given: argparse.Namespace) -> int:
 def written(
     given: argparse.Namespace, parts: Path, setting: EvaluationConfig, per_axis: int, studies: str
 ) -> list[dict[str, Any]]:
-    """The page and all that stands beside it; the rows of the reproduction. What long studies save is in `parts`."""
+    """Runs the reproduction and all studies, writes the page and its files, and returns the reproduction's rows.
+
+    Args:
+      given: the options; `out` and `seed` are read.
+      parts: folder in which long studies save what is done.
+      per_axis: cells of the basins along each axis; 0 for none.
+      studies: none, quick or full.
+    """
     rows = rows_of(given, setting)
 
-    from cpjax.cli import report_sections as sections_of  # matplotlib takes a while; bad input should not wait for it
+    from cpjax.cli import report_sections as sections_of  # matplotlib is slow; bad input should fail before
     from cpjax.cli.compare import compared
     from cpjax.show import comparison
     from cpjax.show.figures import save_figure, success_rates
@@ -71,7 +78,7 @@ def written(
         "A student paper swings a pendulum up with an energy law and catches it with LQR or pole placement. "
         "Here are its controllers, as printed and as corrected, run from many starts.",
     )
-    page.section("What was run")
+    page.section("Setup")
     page.text(
         f"{setting.count} starts from the set `{setting.starts}` (seed {setting.seed}), {setting.duration:g} s each, "
         f"RK4 with a step of {1000 * setting.dt:g} ms, the control held over a step, the voltage clipped at 12 V. "
@@ -85,7 +92,7 @@ def written(
         "`corrected-as-voltage` takes the wanted acceleration for a voltage, and `corrected-centred` has k = 5 and "
         "holds the cart near the middle."
     )
-    page.section("What came out")
+    page.section("Results")
     for sentence in (*findings(rows), comparison.findings(results)[-1]):
         page.text(sentence)
     picture = save_figure(given.out / "success.png", success_rates(rows))
@@ -93,7 +100,7 @@ def written(
     page.table(HEADER, [cells(row) for row in rows], text_columns=4)
     page.note(
         "Settling, travel, effort and variation are over the successful runs, the peak voltage over all. "
-        "Every number stands in `reproduction.json` beside this page."
+        "Every number is in `reproduction.json` beside this page."
     )
     page.section("The paper's Figures 3 to 6, from our runs")
     for name, figure, caption in pictures(setting):
@@ -110,7 +117,7 @@ def written(
         sections_of.basins(page, given, parts, per_axis)
     if studies != "none":
         sections_of.fronts(page, given, parts, studies)
-    page.section("How to get this page again")
+    page.section("How to reproduce this page")
     page.text(
         f"`cpjax report --starts {setting.starts} --count {setting.count} --seed {setting.seed} "
         f"--duration {_shortest(setting.duration)} --dt {_shortest(setting.dt)} --cells {per_axis} "
@@ -121,5 +128,5 @@ def written(
 
 
 def _shortest(seconds: float) -> str:
-    """The number in as few digits as name it exactly."""
+    """Returns the number in six digits if they are exact, else in all of its digits."""
     return f"{seconds:g}" if float(f"{seconds:g}") == seconds else repr(seconds)

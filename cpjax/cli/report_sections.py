@@ -1,4 +1,4 @@
-"""The sections of the report, each from studies that other commands do too."""
+"""The sections of the report, each from a study that another command does too."""
 
 import argparse
 from collections.abc import Mapping
@@ -40,15 +40,15 @@ QUICK_FRONTS: Mapping[str, Any] = {
     "semifinal": 128,
     "final": 256,
 }
-"""Of a `FrontConfig`."""
+"""Fields of a `FrontConfig`."""
 QUICK_TUNING: Mapping[str, Any] = {"candidates": 1023, "restarts": 4, "batch": 8, "steps": 36}
-"""Of a `TuningConfig`."""
+"""Fields of a `TuningConfig`."""
 QUICK_AUDIT: Mapping[str, Any] = {"count": 4, "duration": 3.0, "dt": 0.002}
-"""Of `cpjax audit-gradients`."""
+"""Options of `cpjax audit-gradients`."""
 
 
 def designs(page: Page, given: argparse.Namespace) -> None:
-    """The paper's two regulators as linear designs."""
+    """Adds the section on the paper's two regulators as linear designs, and writes designs.json."""
     plant = paper.appendix_plant()
     gate = AngleGate(paper.SWITCH_ANGLE)
     checks = {
@@ -61,16 +61,16 @@ def designs(page: Page, given: argparse.Namespace) -> None:
     page.text(
         "On the appendix's plant, linearised about upright, with the loop broken at the motor's voltage. Inside the "
         "certified level set the linear loop needs neither the 12 V clip nor the switch at 30 degrees; the last column "
-        "has its widest angle, reached in motion. Leaning at rest in the middle, a smaller one saturates the voltage."
+        "has its widest angle, reached in motion. At rest in the middle, a smaller angle saturates the voltage."
     )
     page.table(
         design_text.COMPARISON, [design_text.compared(*key, check) for key, check in checks.items()], text_columns=2
     )
-    page.note("Every number stands in `designs.json`; `cpjax design` checks any other regulator.")
+    page.note("Every number is in `designs.json`; `cpjax design` checks any other regulator.")
 
 
 def forensics(page: Page, given: argparse.Namespace) -> None:
-    """Where the printed gains come from."""
+    """Adds the section on plants that explain the printed gains, and writes audit_gains.json and audit_gains.png."""
     plant, prints = paper.appendix_plant(), printed_in_the_paper()
     with progress("audit-gains") as report:
         audit = audit_gains(prints, plant, starts=16, seed=given.seed, progress=report)
@@ -92,13 +92,13 @@ def forensics(page: Page, given: argparse.Namespace) -> None:
         [identification_text.fit_cells(fit, plant) for fit in identification_text.shown_fits(audit)],
         text_columns=2,
     )
-    page.note("Every fit stands in `audit_gains.json`; `cpjax audit-gains` does the same for any printed gain.")
+    page.note("Every fit is in `audit_gains.json`; `cpjax audit-gains` does the same for any printed gain.")
     known = [identification_text.direction_cells(d) for d in audit.directions if d.sensitivity > 0.0]
     page.table(identification_text.DIRECTION_HEADER, known, text_columns=1)
 
 
 def gradients(page: Page, given: argparse.Namespace, size: str) -> None:
-    """Which gradients through the switch can be trusted."""
+    """Adds the section on which gradients through the switch can be trusted; `size` is quick or full."""
     plant = paper.appendix_plant()
     audit = audited(given.out, plant, preset("lqr"), QUICK_AUDIT if size == "quick" else {}, given.seed)
 
@@ -112,15 +112,20 @@ def gradients(page: Page, given: argparse.Namespace, size: str) -> None:
         page.text(sentence)
     page.picture(
         (given.out / "audit_gradients.png").read_bytes(),
-        "Left and middle: how far derivatives are from finite differences, with located switches and plainly, by the "
-        "length of the run and by how slowly it crossed the gate. Right: how a change of the start grows.",
+        "Left and middle: error of derivatives against finite differences, with switches located and read once per "
+        "step, by the run's length and its slowest crossing of the gate. Right: growth of a change of the start.",
     )
     page.table(gradients_text.header(audit), gradients_text.cells(audit), text_columns=1)
-    page.note(gradients_text.TITLE + ". Every number stands in `audit_gradients.json`.")
+    page.note(gradients_text.TITLE + ". Every number is in `audit_gradients.json`.")
 
 
 def tuning(page: Page, given: argparse.Namespace, parts: Path, size: str) -> None:
-    """A tuning of each design, from bland gains."""
+    """Adds the section on tuning from the baseline, with tune.json, tune.png and tuned.json in a folder per design.
+
+    Args:
+      parts: folder of checkpoints.
+      size: quick (the first of `DESIGNS`, short) or full (each design).
+    """
     plant = paper.appendix_plant()
     page.section("Tuning by gradients")
     page.text(
@@ -152,13 +157,13 @@ def tuning(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
         ["regulator", "success [%]", "settling [s]", "million steps of values", "of gradients", "time [s]"], rows, 1
     )
     page.note(
-        "Every number stands in `tune.json` in the design's folder (`tune-placement`), the controller beside it in "
+        "Every number is in `tune.json` in the design's folder (`tune-placement`), the controller beside it in "
         "`tuned.json`. Compared below are the tuned controllers that come with cpjax, from a longer search."
     )
 
 
 def comparison(page: Page, given: argparse.Namespace, results: list[Compared], start: str) -> None:
-    """The paper's controllers beside the tuned ones, from what `cpjax.cli.compare.compared` returned."""
+    """Adds the section on the paper's and the tuned controllers, from the results of `cpjax.cli.compare.compared`."""
     page.section("Against tuned gains")
     page.text(
         "Energy gain, cart terms, gate and Q or poles, tuned together by gradients through whole swing-ups (`cpjax "
@@ -168,7 +173,7 @@ def comparison(page: Page, given: argparse.Namespace, results: list[Compared], s
     for sentence in comparison_text.findings(results):
         page.text(sentence)
     page.table(comparison_text.HEADER, [comparison_text.cells(one) for one in results], text_columns=3)
-    page.note("Means over the successful runs. Every number stands in `compare.json` beside this page.")
+    page.note("Means over the successful runs. Every number is in `compare.json` beside this page.")
     page.picture(
         (given.out / "responses.png").read_bytes(),
         f"Angle, cart and voltage under the best of the paper's controllers and the tuned ones, from start {start}.",
@@ -185,7 +190,7 @@ def comparison(page: Page, given: argparse.Namespace, results: list[Compared], s
 
 
 def animation(page: Page, given: argparse.Namespace) -> None:
-    """The paper's controller and the tuned one, moving."""
+    """Adds an animation of the paper's controller and the tuned one."""
     plant = paper.appendix_plant()
     controllers = {name: named_hybrid(name, plant) for name in ("corrected/lqr", "tuned_lqr")}
     path, runs = animated(
@@ -201,34 +206,44 @@ def animation(page: Page, given: argparse.Namespace) -> None:
 
 
 def basins(page: Page, given: argparse.Namespace, parts: Path, cells: int) -> None:
-    """Where the paper's and the tuned controllers work."""
+    """Adds the section on the basins of attraction of the paper's and the tuned controllers.
+
+    Args:
+      parts: folder in which finished maps are saved.
+      cells: along each axis.
+    """
     plant = paper.appendix_plant()
     controllers = {name: named_hybrid(name, plant) for name in basin.CONTROLLERS}
     chart = basin.chart_of({"cells": cells}, given.seed)
     _, header, rows = basin.table(
         basin.drawn(given.out, parts / "basin", plant, controllers, chart, {"duration": 10.0, "dt": 0.002})
     )
-    page.section("Where they work")
+    page.section("Basins of attraction")
     page.text(
         "One run of 10 s from every cell of a map of angle and rate, the cart at rest in the middle. This is the whole "
         "hybrid loop with its clip, sampled, not certified: a start between two that succeed may fail."
     )
     page.picture(
         (given.out / "basin.png").read_bytes(),
-        "Settling time (above) and changes of mode (below) by where a run begins, grey where it does not settle; in "
-        "orange the gate, dashed where the regulator asks for the whole supply, pink what the linear model certifies.",
+        "Settling time (above) and changes of mode (below) by the initial state, grey where a run does not settle. "
+        "Orange: the gate; dashed: the regulator demands the voltage limit; pink: certified for the linear model.",
     )
     page.table(header, rows, text_columns=1)
-    page.note("Every number stands in `basin.json`, every run in the files that it names; `cpjax basin` draws others.")
+    page.note("Every number is in `basin.json`, every run in the files that it names; `cpjax basin` draws others.")
 
 
 def fronts(page: Page, given: argparse.Namespace, parts: Path, size: str) -> None:
-    """What settling faster costs."""
+    """Adds the section on trade-off fronts of settling time against cost.
+
+    Args:
+      parts: folder in which finished searches are saved.
+      size: quick (few steps, the plant's own supply) or full.
+    """
     plan = FrontConfig(seed=given.seed, **(QUICK_FRONTS if size == "quick" else {}))
     found = pareto.made(
         given.out, parts / "pareto", paper.appendix_plant(), plan, () if size == "quick" else pareto.SUPPLIES
     )
-    page.section("At what price")
+    page.section("Settling time against cost")
     if size == "quick":
         page.text(
             f"A quick version, far from converged: {plan.bounds + 1} tunings for each cost, {plan.steps} steps, points "
@@ -239,12 +254,12 @@ def fronts(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
         f"{100 * plan.success:g} % of unseen starts at least, and that no other found beats in both. Traced by "
         "gradients, many tunings side by side under one `vmap`, each with a bound on its cost; a random search of as "
         "many steps is drawn beside them. The hypervolume of a front is the area that it dominates, up to 1.1 times "
-        "the bland start: the plain gains, chosen by rules of thumb, that every search begins with."
+        "the baseline: the untuned gains, chosen by rules of thumb, that every search begins with."
     )
     page.picture(
         (given.out / "pareto.png").read_bytes(),
-        "Down and left is better: what gradients reach (filled) and what random search reaches with as much work "
-        "(crosses); stars are where the search began, hollow marks the paper's controllers and the shipped ones.",
+        "Mean cost against mean settling time, lower left is better. Filled: traced by gradients; crosses: random "
+        "search with as much work; stars: the baselines; hollow: the paper's controllers and the shipped ones.",
     )
     if size == "full":
         page.picture(
@@ -256,4 +271,4 @@ def fronts(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
     page.table(header, rows, text_columns=2)
     for sentence in pareto.costs(found):
         page.note(sentence)
-    page.note("Every point and its parameters stand in `pareto.json`; `cpjax pareto` traces them with more effort.")
+    page.note("Every point and its parameters are in `pareto.json`; `cpjax pareto` traces them with more effort.")

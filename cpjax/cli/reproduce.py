@@ -1,4 +1,4 @@
-"""`cpjax reproduce`: the paper's controllers over a seeded set of starts, as a table, pictures and JSON."""
+"""`cpjax reproduce`: the paper's controllers over a seeded set of initial states, as a table, pictures and JSON."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -42,18 +42,18 @@ def run(given: argparse.Namespace) -> int:
 
 
 def setting_of(given: argparse.Namespace) -> EvaluationConfig:
-    """The evaluation's setting from the options."""
+    """Returns the evaluation's configuration from the options."""
     return EvaluationConfig(seed=given.seed, **resolve(given, EVALUATION_OPTIONS)["evaluation"])
 
 
 def rows_of(given: argparse.Namespace, setting: EvaluationConfig) -> list[dict[str, Any]]:
-    """The reproduction, with progress shown and each row saved."""
+    """Runs the reproduction, shows its progress and saves each row in reproduction.json."""
     with progress("reproduce") as report:
         return reproduce(setting, progress=report, path=given.out / "reproduction.json")
 
 
 def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
-    """The table for people."""
+    """Prints the table."""
     from cpjax.show.reproduction import HEADER, cells
 
     title = "Settling, travel, effort and variation over successes; peak over all runs"

@@ -1,4 +1,4 @@
-"""`cpjax sweep`: many starts, or a million, as a table, a picture and a file of all results."""
+"""`cpjax sweep`: runs from many initial states, as a table, a picture and a file of all results."""
 
 import argparse
 import time

@@ -85,11 +85,11 @@ def run(given: argparse.Namespace) -> int:
     }
     io.write_json(path, document)
 
-    from cpjax.show.figures import response, save_figure  # matplotlib takes a while; bad input should not wait for it
+    from cpjax.show.figures import response, save_figure  # matplotlib is slow; bad input should fail before
 
     picture = given.out / "swingup.png"
     end = float(trajectory.time[-1])
-    until = min(end, float(metrics.settling_time) + 3.0) if bool(metrics.success) else end  # at rest there is no news
+    until = min(end, float(metrics.settling_time) + 3.0) if bool(metrics.success) else end  # settled, plus 3 s
     save_figure(picture, response(trajectory, _title(metrics), until, float(plant.motor.voltage_limit)))
     _print(metrics)
     if not bool(metrics.success):
@@ -119,7 +119,13 @@ def _print(metrics: Metrics) -> None:
 
 
 def reason(run: Trajectory, fold: ProtocolMetrics, *, hybrid: bool) -> str:
-    """Why a run does not count as settled, as far as it is plain to see."""
+    """Says why a run does not count as settled, as far as its trajectory shows.
+
+    Args:
+      run: with every step saved.
+      fold: the metric that did not count it as settled.
+      hybrid: whether the controller has a gate.
+    """
     flag, end = int(run.flag), float(run.time[-1])
     states = np.asarray(run.state.vector())
     x, theta = float(states[-1, 0]), float(states[-1, 2])
@@ -148,5 +154,5 @@ def reason(run: Trajectory, fold: ProtocolMetrics, *, hybrid: bool) -> str:
 
 
 def _first_of_the_last(holds: np.ndarray[Any, Any]) -> int:
-    """Where the stretch begins in which this holds to the end."""
+    """Returns the index from which `holds` (n,) is true to the end; n if it ends false."""
     return len(holds) - int(np.argmin(np.append(holds[::-1], False)))

@@ -1,4 +1,4 @@
-"""Tables for people, on standard output."""
+"""Tables on standard output."""
 
 from collections.abc import Iterable, Sequence
 
@@ -15,7 +15,7 @@ def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]
         table.add_column(name, justify="left" if i < text_columns else "right", overflow="fold")
     for row in rows:
         table.add_row(*map(printable, row))
-    # Where the width is not known (a file, a pipe) lines are as long as they need to be.
+    # Where the width is not known (a file, a pipe) a line may have up to 200 characters.
     width = None if Console().is_terminal else 200
     console = Console(width=width, markup=False)  # [s] is a unit, not a style
     console.print(table)

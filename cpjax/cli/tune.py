@@ -1,4 +1,4 @@
-"""`cpjax tune`: a controller tuned by gradients through swing-ups; a file for `--controller` of others."""
+"""`cpjax tune`: a controller tuned by gradients through swing-ups, as a file for `--controller` of other commands."""
 
 import argparse
 import dataclasses
@@ -24,7 +24,7 @@ from cpjax.tune.config import AGGREGATES, TuningConfig
 from cpjax.tune.objective import Goal
 from cpjax.tune.parameters import FreeParameters, free_parameters
 
-if TYPE_CHECKING:  # with optax, which takes a while
+if TYPE_CHECKING:  # imports optax, which is slow
     from cpjax.tune.outcome import Tuning
 
 _DEFAULTS = {field.name: field.default for field in dataclasses.fields(TuningConfig)}
@@ -44,7 +44,7 @@ _PLANNED = {
     "threshold": "of a success-weighted mean [s]",
     "tail": "share of the worst starts that the mean is taken over",
     "explore": "noise when the worse half of the restarts goes on from the better",
-    "clip": "a start's gradient is shortened to this many times the batch's median norm",
+    "clip": "a start's gradient is norm-clipped to this many times the batch's median norm",
     "screening": "starts by which all candidates are compared",
     "validation": "starts of a validation",
     "validate_every": "steps between validations",
@@ -59,7 +59,7 @@ _PLANNED = {
 OPTIONS = [
     *PLANT_OPTIONS,
     Option("tune", "design", "of the regulator (default lqr)", choices=("lqr", "placement")),
-    Option("tune", "start_from", "bland, paper, or a file with a controller that knows its design (default bland)"),
+    Option("tune", "start_from", "bland, paper, or a file with a controller that has a design (default bland)"),
     Option("tune", "gate", "of bland and paper (default angle-rate)", choices=get_args(GateKind)),
     Option("tune", "frozen", "parameters to leave as they are, with commas between"),
     Option("tune", "free", "the only parameters to change, with commas between"),
@@ -114,9 +114,14 @@ def run(given: argparse.Namespace) -> int:
 def tuned(
     out: Path, plant: CartPole, free: FreeParameters, plan: TuningConfig, checkpoint: Path, notes: Sequence[str] = ()
 ) -> "Tuning":
-    """The tuning, with tuned.json, tune.json and tune.png written."""
+    """Runs the tuning and writes tuned.json, tune.json and tune.png.
+
+    Args:
+      checkpoint: NPZ file from which an interrupted run goes on; removed at the end.
+      notes: for the JSON.
+    """
     from cpjax.tune.outcome import document
-    from cpjax.tune.tuner import tune  # optax takes a while; other commands should not wait for it
+    from cpjax.tune.tuner import tune  # imports optax, which is slow; other commands need none
 
     with progress("tune") as report:
         tuning = tune(plant, free, plan, progress=compiling(report, "loss"), checkpoint=checkpoint)

@@ -1,1 +1,1 @@
-"""Figures and the report page. The only room that imports matplotlib."""
+"""Figures and the report page. The only layer that imports matplotlib."""

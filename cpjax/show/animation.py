@@ -1,4 +1,4 @@
-"""A run, or several side by side, as a moving picture: GIF, MP4, or a page of HTML that needs nothing else."""
+"""Animations of one run, or of several side by side: GIF, MP4, or a self-contained HTML page."""
 
 import contextlib
 import io as buffers
@@ -27,42 +27,45 @@ from cpjax.show.figures import as_text
 from cpjax.sim.rollout import Trajectory
 
 FORMATS = ("gif", "mp4", "html")
-_TRAIL = 0.6  # seconds of the tip's path that stay visible
-_COLOURS = 64  # of a GIF
-_FASTEST_GIF = 50.0  # pictures per second: browsers slow down what is faster
-_MOST_PICTURES = 1500  # of a GIF: they are all in memory
+_TRAIL = 0.6  # visible part of the tip's path [s]
+_COLOURS = 64  # size of a GIF's palette
+_FASTEST_GIF = 50.0  # frames per second: browsers slow down faster GIFs
+_MOST_PICTURES = 1500  # frames of a GIF: all of them are held in memory
 
 Report = Callable[[int, int, str], None]
 
 
 class Scene(NamedTuple):
-    """One run to be shown."""
+    """One run to animate."""
 
     title: str
     colour: str
     trajectory: Trajectory
     length: float
-    """Of the drawn pole: pivot to tip [m]."""
+    """Length of the drawn pole, pivot to tip [m]."""
     voltage_limit: float
-    """[V]."""
+    """Full scale of the voltage bar [V]; inf for no limit."""
 
 
 def encoder() -> str | None:
-    """The program that makes MP4 files, if there is one."""
+    """Returns the path of ffmpeg, which encodes MP4 files; None if it is not installed."""
     return shutil.which("ffmpeg")
 
 
 def save_animation(
     path: Path, scenes: Sequence[Scene], *, duration: float, rate: float = 25.0, report: Report | None = None
 ) -> None:
-    """Writes `duration` seconds of the scenes, in real time, in the format of the suffix; atomically.
+    """Writes the scenes, in real time and atomically, in the format that the suffix names.
 
     Args:
-      rate: pictures per second.
-      report: called with the pictures drawn, their number, and what they are.
+      path: ends in .gif, .mp4 or .html.
+      scenes: drawn side by side.
+      duration: of the animation [s], at most that of the shortest run.
+      rate: frames per second.
+      report: called with the number of frames drawn, their total, and a description.
 
     Raises:
-      InputError: another suffix, no scene, an MP4 without ffmpeg, or a duration or rate that gives no picture.
+      InputError: another suffix, no scene, an MP4 without ffmpeg, or a duration or rate outside its range.
     """
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
@@ -88,7 +91,13 @@ def save_animation(
 
 
 def page(scenes: Sequence[Scene], duration: float, rate: float) -> str:
-    """A page of HTML that draws the scenes itself, with a button and a slider."""
+    """Returns a self-contained HTML page that animates the scenes, with a play button and a time slider.
+
+    Args:
+      scenes: drawn side by side.
+      duration: of the animation [s].
+      rate: frames per second.
+    """
     data = []
     for scene in scenes:
         x, theta, voltage, mode = _sampled(scene.trajectory, duration, rate)
@@ -109,14 +118,14 @@ def page(scenes: Sequence[Scene], duration: float, rate: float) -> str:
 
 
 def _sampled(run: Trajectory, duration: float, rate: float) -> tuple[np.ndarray[Any, Any], ...]:
-    """x, theta, voltage and mode at each picture."""
+    """Returns x, theta, voltage and mode at each frame, four arrays (frames,)."""
     instants = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
     at = np.clip(np.searchsorted(np.asarray(run.time), instants - 1e-9), 0, len(run.time) - 1)
     return tuple(np.asarray(column)[at] for column in (run.state.x, run.state.theta, run.voltage, run.mode))
 
 
 def _half_width(scenes: Sequence[Scene], duration: float) -> float:
-    """Of the view, the same for all [m]: a cart that runs away leaves it."""
+    """Returns half the width of the view [m], the same for all scenes; a cart that runs away leaves it."""
     reach = [
         float(np.max(np.maximum(np.abs(x), np.abs(x - scene.length * np.sin(theta)))))
         for scene in scenes
@@ -128,7 +137,7 @@ def _half_width(scenes: Sequence[Scene], duration: float) -> float:
 
 
 class _Stage:
-    """One scene's axes and what moves in them."""
+    """Axes of one scene, and the artists that move in them."""
 
     def __init__(self, axes: Axes, scene: Scene, half: float) -> None:
         self._scene, self._half = scene, half
@@ -159,7 +168,7 @@ class _Stage:
         self._path: deque[tuple[float, float]] = deque()
 
     def draw(self, x: float, theta: float, voltage: float, mode: int, kept: int) -> None:
-        """At one instant; `kept` is how many points of the trail stay."""
+        """Draws one instant; the trail shows the last `kept` points."""
         scene = self._scene
         tip = x - scene.length * np.sin(theta), scene.length * np.cos(theta)
         self._cart.set_xy((x - 0.5 * self._cart_size[0], -0.5 * self._cart_size[1]))
@@ -177,7 +186,7 @@ class _Stage:
 
 def _pictures(scenes: Sequence[Scene], duration: float, rate: float, report: Report | None) -> Iterator[Image.Image]:
     half = _half_width(scenes, duration)
-    height = 3.9 * 1.55 * max(scene.length for scene in scenes) / half + 1.25  # as high as the view is wide
+    height = 3.9 * 1.55 * max(scene.length for scene in scenes) / half + 1.25  # axes 3.9 in wide
     figure = Figure(figsize=(4.2 * len(scenes), max(2.6, height)), dpi=80, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     stages = [
@@ -192,7 +201,7 @@ def _pictures(scenes: Sequence[Scene], duration: float, rate: float, report: Rep
             stage.draw(float(x[i]), float(theta[i]), float(voltage[i]), int(mode[i]), max(1, round(_TRAIL * rate)))
         canvas.draw()  # type: ignore[no-untyped-call]  # untyped in matplotlib
         if i == 0:
-            figure.set_layout_engine("none")  # as the first picture is laid out, so are the others
+            figure.set_layout_engine("none")  # all frames keep the layout of the first
         if report is not None:
             report(i + 1, count, "pictures")
         pixels: Any = canvas.buffer_rgba()  # type: ignore[no-untyped-call]
@@ -201,14 +210,14 @@ def _pictures(scenes: Sequence[Scene], duration: float, rate: float, report: Rep
 
 def _gif(pictures: Iterator[Image.Image], rate: float) -> bytes:
     every = list(pictures)
-    # The colours of pictures from beginning to end: one alone may lack what moves in later.
+    # The palette comes from frames of the whole run: one frame alone may lack colours that appear later.
     few = every[:: max(1, len(every) // 8)]
     sheet = Image.new("RGB", (few[0].width, few[0].height * len(few)))
     for i, picture in enumerate(few):
         sheet.paste(picture, (0, i * picture.height))
     palette = sheet.quantize(_COLOURS)
     first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in every)
-    # A GIF counts hundredths of a second: rounded so that the film as a whole keeps time.
+    # GIF delays are whole hundredths of a second: the frames' ends are rounded, so that the errors do not add up.
     ends = np.round(100.0 * np.arange(len(every) + 1) / rate).astype(int)
     buffer = buffers.BytesIO()
     first.save(
@@ -232,10 +241,10 @@ def _mp4(pictures: Iterator[Image.Image], rate: float) -> bytes:
         path = Path(folder) / "film.mp4"
         first = next(pictures)
         raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.width}x{first.height}", "-r", str(rate)]
-        even = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]  # what most players want
+        even = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"]  # most players require both
         command = [program, "-y", "-loglevel", "error", *raw, "-i", "-", *even, str(path)]
         with open(Path(folder) / "said", "w+b") as log:
-            with (  # a broken pipe: it has stopped before its time, and says why
+            with (  # a broken pipe: ffmpeg stopped early; the log says why
                 contextlib.suppress(BrokenPipeError),
                 subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log) as process,
             ):

@@ -1,4 +1,4 @@
-"""Maps of where controllers work."""
+"""Maps of basins of attraction: settling time and mode changes over two coordinates of the initial state."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -28,26 +28,30 @@ LABELS = {
 _FAILED = "#c9c9c9"
 _SATURATION, _CERTIFIED = "#111111", "#CC79A7"
 _MOST_SWITCHES = 6
-_FINE = 400  # points along an axis, for lines
+_FINE = 400  # grid points along an axis, for contour lines
 
 
 class Panel(NamedTuple):
-    """One controller's map."""
+    """Map of one controller."""
 
     title: str
     controller: Hybrid
     voltage_limit: float
     check: DesignCheck | None
-    """Of its regulator and gate; None where the library knows no check for them."""
+    """Check of its regulator and gate; None where `check_design` does not support them."""
     metrics: Metrics
     area: Area
 
 
 def basins(chart: StartGrid, panels: Sequence[Panel]) -> Figure:
-    """Settling time and number of mode changes of every cell, a column for each controller, failures grey.
+    """Draws settling time and number of mode changes of every cell, one column per controller; failures are grey.
 
-    Orange: the gate. Black: beyond, the regulator asks for more than the supply gives. Pink: the level set that the
-    linear model certifies. All in the plane in which the other coordinates have their middle values.
+    Orange: the gate. Black: beyond it, the regulator demands more than the voltage limit. Pink: the level set certified
+    for the linear model. The lines hold in the plane in which the other coordinates have their middle values.
+
+    Args:
+      chart: the grid of initial states.
+      panels: one per controller; their metrics are arrays (rows * columns,) in the order of `chart.starts()`.
 
     Raises:
       InputError: no panel.
@@ -85,7 +89,7 @@ def basins(chart: StartGrid, panels: Sequence[Panel]) -> Figure:
     figure.colorbar(drawn[0], ax=axes[0], label="settling time [s] (grey: fails)", extend="max")
     bar = figure.colorbar(drawn[1], ax=axes[1], label="changes of mode", ticks=range(_MOST_SWITCHES + 1))
     bar.ax.set_yticklabels([*map(str, range(_MOST_SWITCHES)), f"{_MOST_SWITCHES}+"])
-    names = ("gate", "regulator asks for the whole supply", "certified for the linear model")
+    names = ("gate", "regulator demands the voltage limit", "certified for the linear model")
     handles = [Line2D([], [], color=GATE_COLOUR), Line2D([], [], color=_SATURATION, linestyle="--")]
     handles.append(Line2D([], [], color=_CERTIFIED))
     figure.legend(handles, names, loc="outside lower center", ncols=3 if len(panels) > 1 else 1, frameon=False)
@@ -95,7 +99,7 @@ def basins(chart: StartGrid, panels: Sequence[Panel]) -> Figure:
 
 
 def _longest(metrics: Metrics) -> float:
-    """What 99 % of the successes settle within."""
+    """Returns the time within which 99 % of the successful runs settle [s]; 1 s if there are none."""
     times = np.asarray(metrics.settling_time)[np.asarray(metrics.success)]
     return float(np.quantile(times, 0.99)) if times.size else 1.0
 

@@ -1,4 +1,4 @@
-"""A comparison of controllers as a table and pictures."""
+"""A comparison of controllers as a table, sentences and figures."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ HEADER = (
 
 
 def cells(one: Compared) -> list[str]:
-    """A row of the table: means over the successful runs, and the longest settling time."""
+    """Returns a row of the table: means over the successful runs, and the longest settling time."""
     good: Mapping[str, Any] = one.summary["over_successes"]
     low, high = one.summary["success_interval"]
 
@@ -62,7 +62,7 @@ def cells(one: Compared) -> list[str]:
 
 
 def findings(results: Sequence[Compared]) -> list[str]:
-    """The paper's own question, answered for its gains and for tuned ones."""
+    """Returns a comparison of LQR and pole placement in words: first for the paper's gains, then for tuned ones."""
     return [_answer(results, tuned=False), _answer(results, tuned=True)]
 
 
@@ -89,11 +89,17 @@ def _answer(results: Sequence[Compared], *, tuned: bool) -> str:
 
 
 Shown: TypeAlias = Mapping[tuple[str, str], tuple[Compared, Trajectory]]
-"""By "paper" or "tuned" and design: a controller, and its run from the one start that is shown."""
+"""A controller and its run from the one initial state shown, by "paper" or "tuned" and design."""
 
 
 def responses(shown: Shown, until: float, limit: float, title: str) -> Figure:
-    """Angle, cart and voltage of the paper's and the tuned controllers from one start, the designs side by side."""
+    """Draws angle, cart position and voltage of the paper's and the tuned controllers, the designs side by side.
+
+    Args:
+      shown: all runs from one initial state.
+      until: end of the time axis [s].
+      limit: voltage limit [V], drawn as dotted lines.
+    """
     figure = Figure(figsize=(12, 8), layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots(3, 2, sharex=True, sharey="row")
@@ -124,13 +130,13 @@ def responses(shown: Shown, until: float, limit: float, title: str) -> Figure:
 
 
 def phase_portraits(plant: CartPole, shown: Shown, title: str) -> Figure:
-    """Angle and rate of the whole runs, over the pendulum's energy and each controller's gate."""
+    """Draws angle and rate of the whole runs, over the pendulum's energy levels and each controller's gate."""
     figure = Figure(figsize=(12, 9), layout="constrained")
     figure.suptitle(title)
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     fastest = max(float(np.max(np.abs(np.asarray(run.state.theta_dot)))) for _, run in shown.values())
     per_lift = 4.0 * float(plant.pole_mass) * float(plant.gravity) * float(plant.pole_length)
-    whole_turn = math.sqrt(per_lift / float(plant.pivot_inertia))  # hanging, with the energy of upright
+    whole_turn = math.sqrt(per_lift / float(plant.pivot_inertia))  # rate when hanging, with the energy of upright
     high = min(1.1 * max(fastest, whole_turn), 2.5 * whole_turn)  # a pole that spins leaves the view
     for column, design in enumerate(SIDE_BY_SIDE):
         for row, kind in enumerate(("paper", "tuned")):
@@ -152,7 +158,7 @@ def phase_portraits(plant: CartPole, shown: Shown, title: str) -> Figure:
         "regulator acts": Line2D([], [], color="0.35", linewidth=2.4),
         "start": Line2D([], [], color="black", marker="o", linestyle="none", markersize=5),
         "energy of upright": Line2D([], [], color="black", linewidth=1.3, linestyle="--"),
-        "other energies, a fifth of the lift apart": Line2D([], [], color="0.75", linewidth=0.8),
+        "other energies, 20 % of 2 m g l apart": Line2D([], [], color="0.75", linewidth=0.8),
         "gate": Patch(facecolor=GATE_COLOUR, alpha=0.25),
     }
     figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=6, frameon=False)
@@ -164,7 +170,7 @@ def _label(one: Compared) -> str:
 
 
 def _energy_and_gate(axes: Axes, plant: CartPole, controller: Hybrid, high: float) -> None:
-    """With the cart at rest in the middle, from hanging to hanging."""
+    """Draws energy levels and gate for the cart at rest at x = 0, for theta from -pi to pi."""
     theta, rate = np.linspace(-np.pi, np.pi, 401), np.linspace(-high, high, 401)
     grid = np.meshgrid(theta, rate)
     state = State(np.zeros_like(grid[0]), np.zeros_like(grid[0]), *grid)
@@ -181,14 +187,19 @@ def _energy_and_gate(axes: Axes, plant: CartPole, controller: Hybrid, high: floa
 
 
 def wrapped(state: State) -> np.ndarray[Any, Any]:
-    """theta modulo a turn, with gaps where it jumps."""
+    """Returns theta (n,), wrapped to [-pi, pi] [rad]; NaN where it jumps by a turn."""
     theta = np.asarray(wrap_angle(state.theta)).copy()
     theta[1:][np.abs(np.diff(theta)) > np.pi] = np.nan
     return theta
 
 
 def by_start(starts: State, results: Sequence[Compared]) -> Figure:
-    """Settling time of every start over its angle and rate; failures as crosses."""
+    """Draws the settling time of every initial state over its angle and rate; failures as crosses.
+
+    Args:
+      starts: of arrays (n,).
+      results: of all controllers compared; the best of each design is drawn, of the paper's and of the tuned ones.
+    """
     figure = Figure(figsize=(12, 6.5), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     theta, rate = np.asarray(starts.theta), np.asarray(starts.theta_dot)
@@ -196,7 +207,7 @@ def by_start(starts: State, results: Sequence[Compared]) -> Figure:
     metrics = [one.metrics for row in shown for one in row]
     times = np.concatenate([np.asarray(one.settling_time)[np.asarray(one.success)] for one in metrics])
     low, high = (float(np.min(times)), float(np.max(times))) if times.size else (1.0, 10.0)
-    low = max(low, 0.1)  # who begins settled has no logarithm
+    low = max(low, 0.1)  # a run that begins settled takes 0 s, which has no logarithm
     high = max(high, 1.01 * low)
     norm = LogNorm(low, high)
     drawn: Any = None

@@ -17,10 +17,10 @@ from cpjax.study.design_check import DesignCheck
 
 _INK, _CLIP = "#333333", "#CC79A7"
 _SMALLEST, _LARGEST = 1e-9, 1e9
-"""Half widths of the plane that can still be drawn [rad and rad/s]."""
+"""Smallest and largest half width of the plane that can be drawn [rad and rad/s]."""
 
 _BEYOND = 1e6
-"""A share of a limit that is as good as any greater one."""
+"""Upper clip of ratios to a limit: larger ratios draw the same."""
 
 COMPARISON = (
     "regulator",
@@ -37,7 +37,7 @@ COMPARISON = (
 
 
 def compared(design: str, gains: str, check: DesignCheck) -> list[str]:
-    """One design as a line of a table."""
+    """Returns one design as a row of the table `COMPARISON`."""
     m = check.margins
     return [
         DESIGN_NAMES[design],
@@ -62,7 +62,7 @@ _MARGINS = {
 
 
 def instability(check: DesignCheck) -> str | None:
-    """Says which pole makes the linear loop unstable, if one does."""
+    """Says which pole makes the linear loop unstable; returns None if it is stable."""
     if bool(check.margins.stable):
         return None
     if not np.all(np.isfinite(check.poles)):
@@ -72,7 +72,11 @@ def instability(check: DesignCheck) -> str | None:
 
 
 def rows(check: DesignCheck, voltage_limit: float) -> list[tuple[str, str, str]]:
-    """What was checked, the figure and its unit."""
+    """Returns the checks as rows of name, value and unit.
+
+    Args:
+      voltage_limit: [V], which the row of the saturation angle names.
+    """
     m = check.margins
     if not bool(m.stable):  # the margins of such a loop are NaN
         margins = [(name, "none", "the linear loop is not stable") for name in _MARGINS]
@@ -103,7 +107,11 @@ def rows(check: DesignCheck, voltage_limit: float) -> list[tuple[str, str, str]]
 
 
 def picture(check: DesignCheck, gate: Gate, voltage_limit: float, title: str) -> Figure:
-    """Poles, and what gate and clip leave of the plane of angle and rate."""
+    """Draws the closed-loop poles; and gate, voltage limit and certified level set in the plane of angle and rate.
+
+    Args:
+      voltage_limit: [V]; inf for none.
+    """
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.axvline(0, color="#999999", linewidth=0.8)
@@ -121,7 +129,7 @@ def picture(check: DesignCheck, gate: Gate, voltage_limit: float, title: str) ->
 def _plane(axes: Axes, check: DesignCheck, gate: Gate, voltage_limit: float) -> None:
     K, widest = check.K[0], min(max(1.3 * check.gate_angle, _SMALLEST), math.pi)
     limited = math.isfinite(voltage_limit)
-    with np.errstate(all="ignore"):  # any number may be extreme; what is clipped below is beyond the picture
+    with np.errstate(all="ignore"):  # extreme numbers may overflow; the results are clipped below
         upright = float(np.float64(1.3 * voltage_limit) / abs(K[3])) if K[3] and limited else 0.0
         tallest = min(max(upright, 3.0 * widest), _LARGEST)
         theta, rate = np.meshgrid(np.linspace(-widest, widest, 301), np.linspace(-tallest, tallest, 301))
@@ -151,7 +159,7 @@ def _plane(axes: Axes, check: DesignCheck, gate: Gate, voltage_limit: float) -> 
 
 
 def _share(values: np.ndarray[Any, Any], whole: float) -> np.ndarray[Any, Any]:
-    """Of a positive whole, up to more than all of it."""
+    """Returns values / whole, for whole > 0, clipped to [0, _BEYOND]; NaN becomes _BEYOND."""
     return np.clip(np.nan_to_num(values / np.float64(whole), nan=_BEYOND), 0.0, _BEYOND)
 
 

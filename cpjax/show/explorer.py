@@ -1,4 +1,4 @@
-"""A picture of one swing-up that follows its controller's numbers: what the sliders of a notebook move."""
+"""A figure of one swing-up that is redrawn for each new controller, for the sliders of a notebook."""
 
 import jax
 import numpy as np
@@ -13,12 +13,17 @@ from cpjax.sim.rollout import Trajectory, rollout
 
 
 class Explorer:
-    """Angle, cart and voltage of a controller, drawn once and moved afterwards.
+    """Figure of angle, cart position and voltage under a controller, drawn once and then updated.
 
-    The rollout is compiled once: another gain, weight, pole or gate is another number in the same program.
+    The rollout is compiled once: a gain, weight, pole or gate parameter is an argument of the compiled program.
+
+    Args:
+      duration: length of the rollout [s].
+      dt: integration step and control period [s].
+      save_every: steps from one drawn sample to the next.
 
     Attributes:
-      figure: what is drawn.
+      figure: the matplotlib figure.
     """
 
     def __init__(
@@ -46,7 +51,7 @@ class Explorer:
         self._title = axes[0].set_title("")
 
     def show(self, controller: Hybrid) -> Figure:
-        """The picture of this controller."""
+        """Simulates this controller, updates the figure and returns it."""
         run = jax.tree.map(np.asarray, self._run(controller))
         for line, values in zip(self._lines, (wrapped(run.state), run.state.x, run.voltage), strict=True):
             line.set_data(run.time, values)

@@ -1,6 +1,6 @@
-"""Figures, as matplotlib `Figure` objects that belong to no window and no global state.
+"""Figures as matplotlib `Figure` objects, without a window or global state.
 
-The palette is Okabe and Ito's, which colour-blind readers can tell apart; a design has the same colour everywhere.
+The palette is Okabe and Ito's, which colour-blind readers can distinguish; a design has the same colour in all figures.
 """
 
 import io as buffers
@@ -21,37 +21,42 @@ DESIGN_COLOURS: Mapping[str, str] = {"lqr": "#D55E00", "placement": "#0072B2"}
 GATE_COLOUR = "#E69F00"
 DESIGN_NAMES: Mapping[str, str] = {"lqr": "LQR", "placement": "pole placement"}
 SIDE_BY_SIDE: tuple[DesignName, ...] = ("lqr", "placement")
-"""From left to right, as the paper's Figures 3 and 4."""
+"""Columns from left to right, in the order of the paper's Figures 3 and 4."""
 _X, _THETA, _VOLTAGE, _CATCH = "#009E73", "#CC79A7", "#333333", "#999999"
 
 
 def design_colour(controller: Hybrid) -> str:
-    """Of a controller whose regulator knows its design; LQR's where it does not."""
+    """Returns the colour of the design of a controller's regulator; LQR's if the regulator has no design."""
     placed = isinstance(getattr(controller.regulator, "design", None), PoleFactors)
     return DESIGN_COLOURS["placement" if placed else "lqr"]
 
 
 def as_text(words: str) -> str:
-    """Words as matplotlib shall print them: without this it takes what is between two dollars for a formula."""
+    """Returns the words with dollars escaped: matplotlib would typeset text between two dollars as a formula."""
     return words.replace("$", r"\$")
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG file's content."""
+    """Returns the figure as the content of a PNG file."""
     buffer = buffers.BytesIO()
     figure.savefig(buffer, format="png", dpi=150)
     return buffer.getvalue()
 
 
 def save_figure(path: Path, figure: Figure) -> bytes:
-    """Writes a PNG atomically; its content."""
+    """Writes a PNG file atomically and returns its content."""
     content = png(figure)
     io.write_bytes(path, content)
     return content
 
 
 def response(trajectory: Trajectory, title: str, until: float, voltage_limit: float) -> Figure:
-    """One rollout up to `until` [s]: positions, rates and voltage, with the time in the regulator shaded."""
+    """Draws positions, rates and voltage of one rollout; the time in the regulator is shaded.
+
+    Args:
+      until: end of the time axis [s].
+      voltage_limit: [V], drawn as dashed lines; inf for none.
+    """
     figure = Figure(figsize=(9, 7.5), layout="constrained")
     axes = figure.subplots(3, 1, sharex=True)
     _positions(axes[0], trajectory)
@@ -64,7 +69,13 @@ def response(trajectory: Trajectory, title: str, until: float, voltage_limit: fl
 
 
 def paper_figures(trajectories: Mapping[Any, Trajectory], title: str, until: float, voltage_limit: float) -> Figure:
-    """Our runs in the places of the paper's Figures 3 (LQR), 4 (pole placement), 5 and 6 (their voltages)."""
+    """Draws our runs in the layout of the paper's Figures 3 (LQR), 4 (pole placement), 5 and 6 (their voltages).
+
+    Args:
+      trajectories: by design.
+      until: end of the time axis [s].
+      voltage_limit: [V], drawn as dashed lines; inf for none.
+    """
     figure = Figure(figsize=(12, 8.5), layout="constrained")
     axes = figure.subplots(3, 2, sharex=True, sharey="row")
     for column, (design, response_number, voltage_number) in enumerate(zip(SIDE_BY_SIDE, (3, 4), (5, 6), strict=True)):
@@ -81,7 +92,11 @@ def paper_figures(trajectories: Mapping[Any, Trajectory], title: str, until: flo
 
 
 def success_rates(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Success rate with its 95 % interval for every law and plant; printed gains solid, computed ones hollow."""
+    """Draws the success rate with its 95 % interval for every law and plant; printed gains solid, computed hollow.
+
+    Args:
+      rows: of `cpjax.paper.reproduction.reproduce`.
+    """
     laws = list(dict.fromkeys(row["law"] for row in rows))
     plants = list(dict.fromkeys(row["plant"] for row in rows))
     figure = Figure(figsize=(10, 1.2 + 1.05 * len(laws) * len(plants) / 2), layout="constrained")
@@ -138,7 +153,7 @@ def _positions(axes: Axes, trajectory: Trajectory) -> None:
     axes.plot(time, np.asarray(state.theta), color=_THETA, label=r"$\theta$ [rad]")
     lowest, highest = axes.get_ylim()
     turns = range(math.ceil(lowest / math.tau), math.floor(highest / math.tau) + 1)
-    for turn in turns if len(turns) <= 20 else ():  # on a pole that spins they would be a grey area
+    for turn in turns if len(turns) <= 20 else ():  # more lines, of a spinning pole, would merge into an area
         axes.axhline(turn * math.tau, color=_THETA, linewidth=0.8, linestyle=":")  # upright
     axes.set_ylabel("position")
     _finish(axes)
@@ -154,7 +169,7 @@ def _rates(axes: Axes, trajectory: Trajectory) -> None:
 
 
 _DRAWABLE = 1e100
-"""The largest number [V] that an axis can hold; matplotlib multiplies them."""
+"""The largest voltage that an axis can hold [V]: matplotlib multiplies such numbers."""
 
 
 def _voltage(axes: Axes, trajectory: Trajectory, limit: float) -> None:

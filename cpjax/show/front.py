@@ -1,4 +1,4 @@
-"""Trade-off fronts."""
+"""Trade-off fronts as figures and sentences."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -16,22 +16,22 @@ COST_LABELS = {
     "cart_travel": "cart travel [m]",
     "voltage_variation": "variation of the voltage [V]",
 }
-_MARKERS = {"paper, as printed": "^", "paper, corrected": "v"}  # others a diamond
+_MARKERS = {"paper, as printed": "^", "paper, corrected": "v"}  # all others: a diamond
 
 
 class Curve(NamedTuple):
-    """A design's front, and what random search found for the same cost."""
+    """Front of one design and one cost, traced by gradients, and that of random search."""
 
     traced: np.ndarray[Any, Any]
-    """Settling times and costs (n, 2)."""
+    """Mean settling times [s] and mean costs (n, 2)."""
     random: np.ndarray[Any, Any]
-    """Likewise (m, 2)."""
+    """The same for random search (m, 2)."""
     traced_volume: float
     random_volume: float
 
 
 class Known(NamedTuple):
-    """A controller to show as a point."""
+    """Controller shown as a point."""
 
     label: str
     design: str
@@ -39,7 +39,7 @@ class Known(NamedTuple):
     """Mean settling time [s]."""
     cost: float
     success: float
-    """Share of the starts."""
+    """Fraction of the initial states from which it settles."""
 
 
 def fronts(
@@ -47,7 +47,13 @@ def fronts(
     bland: Mapping[str, Mapping[str, np.ndarray[Any, Any]]],
     known: Mapping[str, Sequence[Known]],
 ) -> Figure:
-    """One panel for each cost: `curves[cost][design]`, the bland starts, and known controllers as hollow points."""
+    """Draws one panel per cost: the fronts, the baselines as stars, and known controllers as hollow points.
+
+    Args:
+      curves: by cost and design.
+      bland: by cost and design, the baseline's mean settling time [s] and mean cost (2,); not drawn if not finite.
+      known: by cost.
+    """
     figure = Figure(figsize=(5.2 * len(curves), 5.6), layout="constrained")
     panels = figure.subplots(1, len(curves), squeeze=False)[0]
     for axes, (cost, designs) in zip(panels, curves.items(), strict=True):
@@ -56,9 +62,9 @@ def fronts(
         for design, point in bland[cost].items():
             if np.all(np.isfinite(point)):
                 axes.plot(
-                    *point, "*", color=DESIGN_COLOURS[design], markersize=11, label=f"{DESIGN_NAMES[design]}, bland"
+                    *point, "*", color=DESIGN_COLOURS[design], markersize=11, label=f"{DESIGN_NAMES[design]}, baseline"
                 )
-        # The view is that of fronts, bland starts and what nearly always settles; what is beyond stands at its edge.
+        # The view holds fronts, baselines and controllers that nearly always settle; others are drawn at its edge.
         good = [(one.time, one.cost) for one in known[cost] if one.success > 0.9]
         found = [np.concatenate([curve.traced, curve.random]) for curve in designs.values()]
         shown = np.concatenate([*found, np.reshape([*bland[cost].values(), *good], (-1, 2))])
@@ -86,11 +92,11 @@ def fronts(
 
 
 def _view(shown: np.ndarray[Any, Any]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Lower left and upper right corner, with some room around the finite points of those (n, 2)."""
+    """Returns the lower left and upper right corner of the view: the finite points of `shown` (n, 2) and a margin."""
     finite = shown[np.all(np.isfinite(shown), axis=1)]
     if not len(finite):
         return np.array([1.0, 0.0]), np.array([10.0, 1.0])
-    scaled = np.stack([np.log(finite[:, 0]), finite[:, 1]], axis=1)  # as `_time_axis` does
+    scaled = np.stack([np.log(finite[:, 0]), finite[:, 1]], axis=1)  # logarithmic time, as on `_time_axis`
     low, high = np.min(scaled, axis=0), np.max(scaled, axis=0)
     room = np.where(high > low, 0.12 * (high - low), 0.12 * np.maximum(np.abs(high), 1e-9))
     low, high = low - room, high + room
@@ -98,17 +104,17 @@ def _view(shown: np.ndarray[Any, Any]) -> tuple[np.ndarray[Any, Any], np.ndarray
 
 
 class _Times(AutoLocator):
-    """Seconds that a logarithmic axis is marked at."""
+    """Tick locator of a logarithmic time axis [s]."""
 
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
-        """Round ones; of a short stretch, which may hold none of them, a linear axis's."""
+        """Returns round values; those of a linear axis where fewer than three round ones are in range."""
         steps = np.outer(10.0 ** np.arange(-2, 4), [1, 1.5, 2, 2.5, 3, 4, 5, 6, 8]).ravel()
         inside = steps[(steps >= vmin) & (steps <= vmax)]
         return inside.tolist() if len(inside) > 2 else super().tick_values(vmin, vmax)
 
 
 def _time_axis(axes: Axes) -> None:
-    """Logarithmic: the bend of a front is at its fast end."""
+    """Makes the time axis logarithmic: the bend of a front is at its fast end."""
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(_Times())
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -117,7 +123,10 @@ def _time_axis(axes: Axes) -> None:
 
 
 def by_supply(curves: Mapping[float, Mapping[str, Curve]]) -> Figure:
-    """Settling time against effort, a panel for each supply.
+    """Draws settling time against effort, one panel per supply.
+
+    Args:
+      curves: by supply [V] and design.
 
     Raises:
       InputError: no supply.
@@ -142,7 +151,11 @@ def by_supply(curves: Mapping[float, Mapping[str, Curve]]) -> Figure:
 
 
 def findings(curves: Mapping[tuple[float, str], Mapping[str, Curve]]) -> list[str]:
-    """What the fronts say of the two methods and of gradients, a sentence for each supply and cost."""
+    """Returns one sentence per supply and cost that compares the designs, and gradients with random search.
+
+    Args:
+      curves: by (supply [V], cost) and design.
+    """
     sentences = []
     for (supply, cost), designs in curves.items():
         said = [f"{DESIGN_NAMES[design]} {_found(curve)}" for design, curve in designs.items()]
@@ -156,7 +169,7 @@ def findings(curves: Mapping[tuple[float, str], Mapping[str, Curve]]) -> list[st
 
 
 def _found(curve: Curve) -> str:
-    """What either search finds of one design."""
+    """Says what tracing by gradients and random search find for one design."""
     if not len(curve.traced):
         other = "random search has some" if len(curve.random) else "neither does random search"
         return f"has no point by gradients, {other}"
@@ -177,13 +190,13 @@ def _draw(axes: Axes, design: str, curve: Curve) -> None:
 
 
 def _verdict(designs: Mapping[str, Curve]) -> str:
-    """How much smaller the area is that the random search dominates."""
+    """Says by how much the hypervolume of random search differs from that of the traced front."""
     parts = []
     for design, curve in designs.items():
         if curve.traced_volume:
             share = f"{100 * (curve.random_volume / curve.traced_volume - 1.0):+.0f} %"
         else:
             none = "beyond the reference" if len(curve.traced) else "none"
-            share = f"some, of gradients {none}" if len(curve.random) else none
+            share = f"some, by gradients {none}" if len(curve.random) else none
         parts.append(f"{DESIGN_NAMES[design]} {share}")
     return "hypervolume of random search:\n" + ", ".join(parts)

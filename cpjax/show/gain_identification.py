@@ -1,4 +1,4 @@
-"""What an audit of printed gains found, as tables, a picture and sentences."""
+"""An audit of printed gains as tables, a figure and sentences."""
 
 import math
 from collections.abc import Sequence
@@ -16,11 +16,14 @@ from cpjax.plant import CartPole, parameters_of, with_parameters
 FIT_HEADER = ("changed", "to", "worst residual", "force per volt [N/V]", "total damping [N s/m]", "starts that agree")
 DIRECTION_HEADER = ("combination of relative changes", "sensitivity", "known to")
 
-_ROUGHLY = 5.0  # sensitivity at which a change of 10 % is half a last digit
+_ROUGHLY = 5.0  # sensitivity at which a change of 10 % moves the gains by half a last digit
 
 
 def fit_cells(fit: Fit, plant: CartPole) -> list[str]:
-    """One fit as text: with it, two numbers of the linear model that the motor's parameters only enter through."""
+    """Returns one fit as a row of `FIT_HEADER`, with force per volt and total damping of the fitted plant.
+
+    The motor enters the linear model only through these two and the reflected mass of its rotor.
+    """
     units = {name: rule.unit for name, rule in parameters_of(plant).items()}
     with_it = with_parameters(plant, dict(zip(fit.parameters, fit.values, strict=True)))
     return [
@@ -34,7 +37,7 @@ def fit_cells(fit: Fit, plant: CartPole) -> list[str]:
 
 
 def direction_cells(direction: Direction) -> list[str]:
-    """One combination as text, its larger weights only."""
+    """Returns one combination as a row of `DIRECTION_HEADER`, with weights of at least 0.1 only."""
     strong = sorted(direction.weights.items(), key=lambda item: -abs(item[1]))
     words = " ".join(f"{w:+.2f} {name}" for name, w in strong if abs(w) >= 0.1)
     known = "not at all" if math.isinf(direction.known_to) else f"{100 * direction.known_to:.2g} %"
@@ -42,14 +45,16 @@ def direction_cells(direction: Direction) -> list[str]:
 
 
 def shown_fits(audit: GainAudit) -> list[Fit]:
-    """Those worth a line: the best of each size, and all that explain the gains with the fewest changes."""
+    """Returns the fits for the table: all that explain the gains with the fewest changes, after the best of each size
+    below; the best of each size if none explains them.
+    """
     sizes = sorted({len(fit.parameters) for fit in audit.fits})
     best = [audit.best(size) for size in sizes if not audit.simplest or size < len(audit.simplest[0].parameters)]
     return [*best, *audit.simplest] if audit.simplest else best
 
 
 def findings(audit: GainAudit) -> list[str]:
-    """What the audit says, each sentence with its figures."""
+    """Returns the results of the audit as sentences with figures."""
     worst = max(abs(r) for r in audit.unchanged)
     within = sum(abs(r) <= EXPLAINED for r in audit.unchanged)
     sentences = [
@@ -77,7 +82,7 @@ def findings(audit: GainAudit) -> list[str]:
 
 
 def picture(audit: GainAudit) -> Figure:
-    """Worst residual for each parameter and pair that may change, and the singular values."""
+    """Draws the worst residual for each parameter and pair that may change, and the singular values."""
     names = [fit.parameters[0] for fit in audit.fits if len(fit.parameters) == 1]
     pairs = any(len(fit.parameters) == 2 for fit in audit.fits)
     figure = Figure(figsize=(12.5, 7.2) if pairs else (12.5, 5), layout="constrained")
@@ -87,14 +92,14 @@ def picture(audit: GainAudit) -> Figure:
     shown = [v if v > 0 else math.nan for v in values]
     right.semilogy(range(1, len(values) + 1), shown, "o", color="#0072B2", label="known by the gains")
     zeros = [i + 1 for i, v in enumerate(values) if v == 0]
-    if zeros:  # below everything else, at the axis's foot: a logarithmic one has no place for them
+    if zeros:  # at the bottom, below all other points: a logarithmic axis cannot show zero
         foot = right.get_xaxis_transform()
         right.plot(zeros, [0.04] * len(zeros), "v", color="#D55E00", transform=foot, label="0: not known at all")
         right.set_ylim(bottom=min([_ROUGHLY, *(v for v in values if v > 0)]) / 20)
     right.axhline(_ROUGHLY, color="#999999", linestyle="--", label="a change of 10 % is half a last digit")
     right.set_xlabel("combination of parameters, best known first")
     right.set_ylabel("units of the last digit per relative change by 1")
-    right.set_title("What the gains know of the plant", loc="left")
+    right.set_title("Sensitivity of the gains to the plant", loc="left")
     right.set_xlim(0.5, len(values) + 0.5)
     right.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     right.legend(frameon=False, loc="upper left", bbox_to_anchor=(0.0, -0.1))  # the points may be anywhere inside
@@ -109,7 +114,7 @@ def _residual_map(figure: Figure, axes: Axes, audit: GainAudit, names: Sequence[
             i, j = (names.index(n) for n in (fit.parameters * 2)[:2])
             worst[i, j] = worst[j, i] = fit.worst
     top = np.max(worst, where=np.isfinite(worst), initial=EXPLAINED)
-    # Cells need not be square: with a fixed aspect, the layout does not see how much room the labels need.
+    # Cells need not be square: with a fixed aspect, the layout ignores the space that the labels need.
     image = axes.imshow(np.maximum(worst, 1e-3), norm=LogNorm(0.1, top), cmap="cividis_r", aspect="auto")
     for (i, j), value in np.ndenumerate(worst):
         if value <= EXPLAINED:

@@ -1,4 +1,4 @@
-"""What an audit of gradients found, as tables, a picture and sentences."""
+"""An audit of gradients as a table, a figure and sentences."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
@@ -14,23 +14,24 @@ Numbers: TypeAlias = np.ndarray[Any, Any]
 
 _COLOURS: Mapping[str, str] = {"located": "#0072B2", "plain": "#D55E00"}
 TITLE = "Median relative error of derivatives, against finite differences (and how many have the wrong sign)"
-_LEAST = 1e-13  # smaller errors are drawn there
+_LEAST = 1e-13  # smaller errors are drawn at this value
 
 
 def methods(audit: GradientAudit) -> list[tuple[str, Numbers]]:
-    """The ways to a derivative by name, and what each found (n, k, d)."""
+    """Returns each method of differentiation by name, with its derivatives (starts, horizons, parameters)."""
     smooth = [(f"smooth {t:g}", g) for t, g in zip(audit.temperatures, audit.smooth, strict=True)]
     return [("located", audit.located), ("plain", audit.plain), *smooth]
 
 
 def header(audit: GradientAudit) -> list[str]:
-    """Of `cells`."""
+    """Returns the column titles of `cells`."""
     return ["parameter", "compared", *(name for name, _ in methods(audit))]
 
 
 def cells(audit: GradientAudit) -> list[list[str]]:
-    """For each parameter the median error of each method and, in brackets, how many signs are wrong; a zero where there
-    is a derivative counts as wrong. Over the starts that can be trusted, at the last horizon.
+    """Returns for each parameter the median error of each method and, in brackets, the number of wrong signs.
+
+    They are over the trustworthy initial states, at the last horizon. A zero in place of a derivative counts as wrong.
     """
     lines = []
     for i, name in enumerate(audit.names):
@@ -42,7 +43,7 @@ def cells(audit: GradientAudit) -> list[list[str]]:
 
 
 def findings(audit: GradientAudit) -> list[str]:
-    """What the audit says, each sentence with its figures."""
+    """Returns the results of the audit as sentences with figures."""
     kinds = [kind for kind, _ in audit.verdicts]
     counts = ", ".join(f"{kinds.count(k)} {k}" for k in ("trustworthy", "grazing", "chaotic", "stopped"))
     sentences = [f"Of {len(kinds)} starts: {counts}."]
@@ -63,7 +64,11 @@ def findings(audit: GradientAudit) -> list[str]:
 
 
 def picture(audits: Sequence[GradientAudit]) -> Figure:
-    """Errors against the horizon and against the slowest crossing, and growth of sensitivity with the horizon."""
+    """Draws errors over the horizon and over the slowest crossing, and the growth of sensitivity with time.
+
+    Args:
+      audits: all with the same horizons.
+    """
     figure = Figure(figsize=(13, 4.4), layout="constrained")
     by_horizon, by_speed, growth = figure.subplots(1, 3)
     for method, colour in _COLOURS.items():
@@ -84,7 +89,7 @@ def picture(audits: Sequence[GradientAudit]) -> Figure:
         )
     by_horizon.set_xlabel("horizon of the objective [s]")
     by_horizon.set_ylabel("relative error of a derivative")
-    by_horizon.set_title("median, and what 95 % stay below", loc="left")
+    by_horizon.set_title("median, and 95th percentile (dashed)", loc="left")
     by_horizon.legend()
     by_speed.set_xlabel("slowest crossing of the gate [1/s]")
     by_speed.set_title("worst derivative of each run", loc="left")
@@ -95,7 +100,7 @@ def picture(audits: Sequence[GradientAudit]) -> Figure:
     growth.semilogy(audits[0].horizons, np.nanmedian(growths, axis=0), "o-", color="#000000", label="median")
     growth.set_xlabel("time [s]")
     growth.set_ylabel("norm of d state / d start")
-    growth.set_title("what becomes of a change of the start", loc="left")
+    growth.set_title("growth of a change of the initial state", loc="left")
     growth.legend()
     for axes in (by_horizon, by_speed, growth):
         axes.grid(alpha=0.3)

@@ -1,4 +1,4 @@
-"""A report as one self-contained HTML page: no script, no request, pictures inside."""
+"""A report as one self-contained HTML page: no script, no request, embedded pictures."""
 
 import base64
 import html
@@ -43,15 +43,15 @@ class Page:
         self._body.append(f"<h2>{html.escape(title)}</h2>")
 
     def text(self, text: str) -> None:
-        """A paragraph; `code` in backticks."""
+        """Adds a paragraph; text between backticks is set as code."""
         self._body.append(f"<p>{_inline(text)}</p>")
 
     def note(self, text: str) -> None:
-        """A paragraph in small print."""
+        """Adds a paragraph in small print."""
         self._body.append(f'<p class="note">{_inline(text)}</p>')
 
     def table(self, header: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int) -> None:
-        """A table whose first `text_columns` columns are words and whose others are numbers."""
+        """Adds a table whose first `text_columns` columns are words and whose others are numbers."""
 
         def row(tag: str, cells: Sequence[str]) -> str:
             kinds = [' class="text"' if i < text_columns else "" for i in range(len(cells))]
@@ -62,7 +62,7 @@ class Page:
         self._body.append(f'<div class="scroll"><table>{head}<tbody>\n{body}\n</tbody></table></div>')
 
     def picture(self, content: bytes, caption: str, kind: str = "png") -> None:
-        """A figure, `kind` png or gif, with one sentence that says what to see."""
+        """Adds a figure from the content of an image file, `kind` png or gif; the caption says what to see."""
         data = base64.b64encode(content).decode("ascii")
         alt = html.escape(caption, quote=True)
         image = f'<img alt="{alt}" src="data:image/{kind};base64,{data}">'
@@ -82,6 +82,6 @@ class Page:
 
 
 def _inline(text: str) -> str:
-    """Escaped text, with what stands between backticks as code."""
+    """Returns the text escaped for HTML, with text between backticks as code."""
     pieces = html.escape(text).split("`")
     return "".join(f"<code>{piece}</code>" if i % 2 else piece for i, piece in enumerate(pieces))

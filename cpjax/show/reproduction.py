@@ -1,4 +1,4 @@
-"""The reproduction of the paper as tables, pictures and sentences."""
+"""The reproduction of the paper as a table, figures and sentences."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from cpjax.paper.reproduction import EvaluationConfig, representative, trajector
 from cpjax.show.figures import DESIGN_NAMES, SIDE_BY_SIDE, paper_figures
 
 SHOWN = (("as-printed", "appendix", 10.0), ("corrected-centred", "appendix", 10.0))
-"""Law, plant and longest shown time [s] of the pictures that stand for the paper's Figures 3 to 6."""
+"""Law, plant and longest time shown [s] of the figures in the places of the paper's Figures 3 to 6."""
 
 HEADER = (
     "law",
@@ -31,7 +31,7 @@ HEADER = (
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
-    """One row of the table, as text."""
+    """Returns one row of the reproduction as text, in the columns of `HEADER`."""
     good = row["over_successes"]
     low, high = row["success_interval"]
 
@@ -55,7 +55,7 @@ def cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def pictures(setting: EvaluationConfig) -> list[tuple[str, Figure, str]]:
-    """Our Figures 3 to 6: for each law of `SHOWN` a file name, the figure, and its caption."""
+    """Returns our Figures 3 to 6: for each law of `SHOWN` a file name, the figure and its caption."""
     results = []
     for law, plant, until in SHOWN:
         words, start = representative(law, plant, setting)
@@ -71,7 +71,7 @@ def pictures(setting: EvaluationConfig) -> list[tuple[str, Figure, str]]:
 
 
 def findings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What the rows say about the paper's claims, each with its figures."""
+    """Returns what the rows say about the paper's claims, as sentences with figures."""
 
     def rate(law: str, design: str) -> str:
         keys = {"law": law, "plant": "appendix", "design": design, "gains": "printed"}

@@ -1,4 +1,4 @@
-"""Pictures of a sweep."""
+"""The figure of a sweep."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -7,12 +7,17 @@ from cpjax.numeric.angles import wrap_angle
 from cpjax.plant.state import State
 from cpjax.sim.metrics import Metrics
 
-_MOST = 20_000  # dots that a picture can use
+_MOST = 20_000  # dots of a scatter plot; thinning leaves up to twice as many
 _FAILED = "#D55E00"
 
 
 def picture(starts: State, metrics: Metrics) -> Figure:
-    """Settling time over the starts' angle and rate, and how it is distributed; failures in a colour of their own."""
+    """Draws the settling time over the initial angle and rate, with failures in another colour, and its histogram.
+
+    Args:
+      starts: initial states, of arrays (n,).
+      metrics: of arrays (n,).
+    """
     some = slice(None, None, max(1, len(np.asarray(starts.x)) // _MOST))
     from_hanging = np.degrees(np.asarray(wrap_angle(np.asarray(starts.theta)[some] - np.pi)))
     rate = np.asarray(starts.theta_dot)[some]

@@ -1,4 +1,4 @@
-"""Pictures of a tuning."""
+"""The figure of a tuning."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,9 +10,7 @@ _OTHERS = "#999999"
 
 
 def picture(tuning: Tuning) -> Figure:
-    """Settling time and success rate of every restart over the steps; the best one of each validation in the colour of
-    its design.
-    """
+    """Draws settling time and success rate of every restart over the steps; the best of each validation in colour."""
     colour = design_colour(tuning.controller)
     steps = np.array([record["step"] for record in tuning.history])
     times = np.array([record["settling_times"] for record in tuning.history])
