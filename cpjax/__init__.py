@@ -1,11 +1,12 @@
 """cpjax: a motor-driven cart-pole in pure JAX.
 
-A plant, a controller and a start go in; a trajectory, its metrics and their derivatives come out, for one start or a
-million. Importing this package starts no JAX backend, draws nothing and changes none of JAX's settings.
+From a plant, a controller and an initial state the package computes a trajectory, its metrics and their derivatives,
+for one initial state or a million. Importing it starts no JAX backend, loads no plotting library and changes none of
+JAX's settings.
 """
 
 from cpjax import _moved as _moved
-from cpjax import startup as _startup  # noqa: F401  # first of all: the other imports take a second
+from cpjax import startup as _startup  # noqa: F401  # must be first: the other imports take a second
 
 # isort: split
 import importlib

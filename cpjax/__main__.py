@@ -1,4 +1,4 @@
-"""`python -m cpjax` is `cpjax`."""
+"""Entry point of `python -m cpjax`, the same as the command `cpjax`."""
 
 import sys
 

@@ -1,6 +1,6 @@
-"""Checks of what a user's law, gate, plant, controller or metric returns, made once, while JAX traces it.
+"""Checks of the values that a user's law, gate, plant, controller or metric returns, made once, while JAX traces it.
 
-Without them a wrong shape or a missing argument surfaces as an error of JAX that points to a line of the library.
+Without these checks a wrong shape or a missing argument causes an error of JAX that points to a line of the library.
 """
 
 import inspect
@@ -13,15 +13,15 @@ from cpjax.errors import InputError
 
 
 def call(name: str, component: Any, method: str, *arguments: Any) -> Any:
-    """Calls a method of a user's component.
+    """Calls a method of a user's component and returns its result; `name` is the component's name in error messages.
 
     Raises:
-      InputError: it does not take so many arguments.
+      InputError: the method does not accept this number of arguments.
     """
     function = getattr(component, method)
     try:
         signature = inspect.signature(function)
-    except (TypeError, ValueError):  # written in C, perhaps; then Python itself has to say what is wrong
+    except (TypeError, ValueError):  # no signature, as for some functions in C: Python's own error applies
         return function(*arguments)
     try:
         signature.bind(*arguments)
@@ -33,19 +33,19 @@ def call(name: str, component: Any, method: str, *arguments: Any) -> Any:
 
 
 def real(name: str, value: Any, dtype: Any = None) -> jax.Array:
-    """Returns what a component returned as an array of shape (), of `dtype` if one is given.
+    """Converts a number that a component returned to an array of shape (), of `dtype` if one is given.
 
     Raises:
-      InputError: it is no real scalar.
+      InputError: the value is not a real scalar.
     """
     return _scalar(name, value, "a scalar, a real number of shape ()", jnp.integer, jnp.floating, dtype=dtype)
 
 
 def integer(name: str, value: Any) -> jax.Array:
-    """Returns a mode that a component returned, as int32.
+    """Converts a mode that a component returned to an int32 array of shape ().
 
     Raises:
-      InputError: it is no integer scalar.
+      InputError: the value is not an integer scalar.
     """
     return _scalar(name, value, "a mode, an integer of shape ()", jnp.integer, dtype=jnp.int32)
 
@@ -61,10 +61,10 @@ def _scalar(name: str, value: Any, allowed: str, *kinds: Any, dtype: Any) -> jax
 
 
 def like(name: str, value: Any, expected: Any) -> Any:
-    """Returns a tree that a component returned, checked against one of the structure, shapes and dtypes it has to have.
+    """Returns a tree that a component returned, after comparing its structure, shapes and dtypes with `expected`.
 
     Raises:
-      InputError: it has others; the first difference is named.
+      InputError: they differ; the first difference is named.
     """
     wanted: Any = jax.tree.structure(expected)
     found = jax.tree.structure(value)
@@ -81,10 +81,10 @@ def like(name: str, value: Any, expected: Any) -> Any:
 
 
 def pair(name: str, value: Any, what: str) -> tuple[Any, Any]:
-    """Returns a pair that a component returned.
+    """Returns a pair that a component returned; `what` describes its content in error messages.
 
     Raises:
-      InputError: it is none.
+      InputError: the value is not a tuple of length 2.
     """
     if not isinstance(value, tuple) or len(value) != 2:
         raise InputError(name, _kind_of(value), f"a pair, {what}")

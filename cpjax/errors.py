@@ -1,4 +1,4 @@
-"""The one exception for bad input: it names the field, the value and what would have been allowed."""
+"""The exception for bad input, which names field, value and allowed range, and the package's warnings."""
 
 from typing import Any
 
@@ -7,9 +7,9 @@ class InputError(ValueError):
     """A value from outside (an argument, a file, an option) that the library cannot use.
 
     Attributes:
-      field: where the value stood, as the user wrote it (``CartPole.cart_mass``, ``dt``, ``plant.toml: [motor] mass``).
+      field: where the value was given, as the user wrote it (``CartPole.cart_mass``, ``dt``, ``plant.toml: [motor] mass``).
       value: the value itself.
-      allowed: what would have been accepted, with its unit.
+      allowed: what is accepted, with its unit.
     """
 
     def __init__(self, field: str, value: Any, allowed: str) -> None:
@@ -20,7 +20,7 @@ class InputError(ValueError):
 
 
 class MissingError(InputError):
-    """A value that has to be given and was not."""
+    """A required value that was not given."""
 
     def __init__(self, field: str, why: str) -> None:
         super().__init__(field, None, f"given, because {why}")
@@ -28,12 +28,12 @@ class MissingError(InputError):
 
 
 def one_line(text: str) -> str:
-    """The text without line breaks, and with nothing in it that controls a terminal."""
+    """Returns the text on one line, with characters that could control a terminal escaped."""
     return printable(" ".join(text.splitlines()))
 
 
 def printable(text: str) -> str:
-    """The text with escapes for what is no printable character, such as those in the names of files."""
+    """Returns the text with non-printable characters, as they occur in the names of files, escaped."""
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
@@ -43,8 +43,8 @@ def _short(value: Any) -> str:
 
 
 class DerivativeWarning(UserWarning):
-    """A derivative was asked for that leaves something out; the message says what, and how to ask for it."""
+    """A requested derivative omits an effect; the message names the effect and how to include it."""
 
 
 class PerformanceWarning(UserWarning):
-    """Something runs much slower than it could; the message says why."""
+    """A computation runs much slower than it could; the message gives the reason."""

@@ -1,8 +1,8 @@
-"""Files: plants, controllers and results as JSON or TOML, written atomically.
+"""Reading and atomic writing of plants, controllers and results as JSON or TOML files.
 
 A file holds one component as a table of its fields, tagged with its `type`; the outermost table also has `schema`.
 Python floats stay numbers, float64 arrays are plain lists, other arrays are tables of `dtype` and `values`. JSON has no
-infinities, so there they are the strings "inf", "-inf" and "nan".
+non-finite numbers; they are the strings "inf", "-inf" and "nan" there.
 """
 
 import contextlib
@@ -48,13 +48,13 @@ from cpjax.sim.rollout import Trajectory
 _NON_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 SCHEMA = 1
-"""Version of the files' layout."""
+"""Version of the file layout."""
 
 DTYPES = ("bool", "int32", "int64", "float32", "float64")
-"""What the numbers of a file's arrays may be."""
+"""Allowed dtypes of the arrays in a file."""
 
 _KINDS = {"b": "b", "i": "iu", "f": "fiu"}
-"""By the kind of a dtype, the kinds of the values that stand for it."""
+"""For each kind of dtype, the kinds that the values of such an array may have in a file."""
 
 TYPES: dict[str, type] = {
     cls.__name__: cls
@@ -78,20 +78,20 @@ TYPES: dict[str, type] = {
         Trajectory,
     )
 }
-"""What can be saved, by the tag in the file; see `register`."""
+"""Classes that can be saved, by their tag in the file; see `register`."""
 
 _REGISTERING = ("cpjax.paper",)
-"""Modules that register more types when they are imported, which happens when a file holds a type not known before."""
+"""Modules that register more types when they are imported; imported when a file holds an unknown type."""
 
 _UNCHECKED = (State, Metrics, Trajectory)
-"""Classes whose constructors take anything."""
+"""Classes whose constructors accept any value."""
 
 
 def register(cls: type) -> type:
-    """Lets instances of a class made by `cpjax.pytree.pytree` be saved and loaded, under the class's name.
+    """Registers a class made by `cpjax.pytree.pytree` for saving and loading under its name, and returns the class.
 
     Raises:
-      InputError: another class of that name is known.
+      InputError: another class of that name is registered.
     """
     if TYPES.setdefault(cls.__name__, cls) is not cls:
         raise InputError("cls", cls, "a class with a name of its own")
@@ -106,10 +106,15 @@ def _known_type(tag: Any) -> type | None:
 
 
 def save(path: str | Path, thing: Any) -> None:
-    """Writes a plant, controller, state or result; JSON or TOML by the path's extension.
+    """Writes a plant, controller, state or result to a file, as JSON or TOML by its extension.
+
+    Args:
+      path: a file name that ends in .json or .toml.
+      thing: an instance of a class in `TYPES`.
 
     Raises:
-      InputError: another extension, a component that is not in `TYPES`, or values that JAX is tracing.
+      InputError: another extension, a class that is not in `TYPES`, values that JAX is tracing, or a path that cannot
+        be written.
     """
     path = _checked_path(path)
     suffix = _suffix(path)
@@ -118,7 +123,10 @@ def save(path: str | Path, thing: Any) -> None:
 
 
 def load(path: str | Path) -> Any:
-    """What `save` wrote, or a file written by hand in the same layout. Fields with a default may be left out.
+    """Reads a file that `save` wrote, or one written by hand in the same layout; fields with a default may be left out.
+
+    Args:
+      path: a file name that ends in .json or .toml.
 
     Raises:
       InputError: no such file, not JSON or TOML, another schema, an unknown type or key, a missing key, or a value
@@ -135,14 +143,15 @@ def load(path: str | Path) -> Any:
 
 
 def load_part(path: str | Path, key: Literal["plant", "controller"], wanted: str) -> Any:
-    """What `load` returns; of a result that a command wrote, its plant or its controller.
+    """Reads a component as `load` does, or the plant or controller of a result that a command wrote.
 
     Args:
-      key: the part of a result, and what the error names.
-      wanted: in words, for the error.
+      path: a file name that ends in .json or .toml.
+      key: the part of a result that is read, and the field that the error names.
+      wanted: what the file should hold, in words, for the error.
 
     Raises:
-      InputError: as `load` does, or the file holds something else.
+      InputError: as for `load`, or the file holds something else.
     """
     path = _checked_path(path)
     table = read_table(path)
@@ -154,7 +163,7 @@ def load_part(path: str | Path, key: Literal["plant", "controller"], wanted: str
 
 
 def contents(table: Mapping[str, Any]) -> str:
-    """What a file's table holds, in words."""
+    """Describes in words what a file's table holds."""
     if "type" in table:
         return f"a {table['type']}" if isinstance(table["type"], str) else "a table whose type is no text"
     if isinstance(table.get("what"), str):
@@ -164,19 +173,23 @@ def contents(table: Mapping[str, Any]) -> str:
 
 
 def encode(thing: Any) -> dict[str, Any]:
-    """A component as a table of plain values."""
+    """Converts a component to a table of plain values.
+
+    Raises:
+      InputError: a class that is not in `TYPES`, values that JAX is tracing, or values that are not numbers.
+    """
     name = type(thing).__name__
     if TYPES.get(name) is not type(thing):
         raise InputError("thing", thing, "one of " + ", ".join(TYPES))
     fields = {f.name: getattr(thing, f.name) for f in dataclasses.fields(TYPES[name])}
-    if isinstance(thing, Trajectory):  # what the plant keeps stands beside the rest
+    if isinstance(thing, Trajectory):  # the plant's saved outputs become keys beside the other fields
         fields |= fields.pop("outputs")
     given = {key: value for key, value in fields.items() if value is not None}
     return {"type": name, **{key: _encode_value(f"{name}.{key}", value) for key, value in given.items()}}
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """The outermost table of a JSON or TOML file.
+    """Reads the outermost table of a JSON or TOML file.
 
     Raises:
       InputError: no such file, or not a table in the format of its extension.
@@ -201,9 +214,9 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def dump_json(data: Any) -> str:
-    """Strict JSON; non-finite numbers as strings."""
+    """Formats plain values as strict JSON, with non-finite numbers as strings."""
     text = json.dumps(_plain(data), indent=1, allow_nan=False)
-    # A list of numbers on one line. Strings hold no raw line breaks, so none of them is touched.
+    # Puts each list of numbers on one line. JSON strings hold no raw line breaks, so none of them changes.
     return re.sub(r"\[[^][{}]*\]", lambda match: re.sub(r"\n\s*", " ", match[0]), text) + "\n"
 
 
@@ -213,15 +226,15 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file atomically: it has its old content or all of the new, whatever happens in between.
+    """Writes a file atomically: even after an interruption it has either its old content or all of the new.
 
     Raises:
-      InputError: the folder cannot be made or written.
+      InputError: the folder cannot be created, or the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
-        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)  # the umask has its say
+        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)  # less the umask
     except (OSError, ValueError) as problem:  # ValueError: a null byte in the path
         raise InputError("path", str(path), f"a place that can be written ({problem})") from problem
     try:
@@ -241,11 +254,17 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 @contextlib.contextmanager
 def parts_of(folder: Path, request: Mapping[str, Any]) -> Iterator[Path]:
-    """A folder for the parts of a long work. It is gone when the work is done, or ends before it has saved any; if
-    anything else stops the work, the parts stay for the next time that the same is asked for.
+    """Provides a folder for the partial results of a long computation, as a context manager.
+
+    The folder is removed when the computation completes, or stops before it has saved anything. If it stops later, the
+    partial results stay for the next call with the same request.
+
+    Args:
+      folder: the folder, which need not exist.
+      request: plain values that identify the computation, such as its options, seeds and versions.
 
     Raises:
-      InputError: as `claim` does.
+      InputError: as for `claim`.
     """
     path = folder / "request.json"
     claim(path, request)
@@ -259,10 +278,14 @@ def parts_of(folder: Path, request: Mapping[str, Any]) -> Iterator[Path]:
 
 
 def claim(path: Path, request: Mapping[str, Any]) -> None:
-    """Makes the folder of `path` the place for a work's parts, or sees that it is; the file says which work's they are.
+    """Reserves a folder for the partial results of a computation, or checks that it is reserved for the same one.
+
+    Args:
+      path: the file in this folder that records the request.
+      request: plain values that identify the computation.
 
     Raises:
-      InputError: there are parts of other work, or nothing can be written.
+      InputError: the folder holds partial results of another request, or cannot be written.
     """
     asked = dump_json(request)
     try:
@@ -278,14 +301,14 @@ def claim(path: Path, request: Mapping[str, Any]) -> None:
 
 
 def release(folder: Path) -> None:
-    """Removes a claimed folder. Whatever happens in between, no part of it is left where a claim could find it."""
+    """Removes a claimed folder, after renaming it, so that an interruption leaves no partial results under its name."""
     away = folder.with_name(f".{folder.name}.{os.getpid()}-{secrets.token_hex(4)}")
     folder.replace(away)
     shutil.rmtree(away)
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a result depends on; "0+unknown" for a package that runs without having been installed."""
+    """Returns the versions of cpjax, JAX, NumPy and SciPy; "0+unknown" for a package that is not installed."""
     return {name: _version(name) for name in ("cpjax", "jax", "jaxlib", "numpy", "scipy")}
 
 
@@ -354,14 +377,14 @@ def _decode(table: dict[str, Any], path: str) -> Any:
 
 
 def _check_numbers(cls: type, values: Mapping[str, Any], path: str) -> None:
-    """Refuses what JAX could not compute with, in a class whose constructor takes anything."""
+    """Refuses values that JAX cannot compute with, in a class whose constructor accepts any value."""
     for key, value in values.items():
         name = f"{path}: {cls.__name__}.{key}"
         number = isinstance(value, (int, float, np.ndarray)) and not (cls is State and isinstance(value, bool))
         if key == "state":
             good, allowed = isinstance(value, State), "a table of the type State"
         elif key == "metrics":
-            good, allowed = number or dataclasses.is_dataclass(value), "what a rollout's fold returned"
+            good, allowed = number or dataclasses.is_dataclass(value), "the result of a rollout's metrics"
         else:
             good, allowed = number, "a number or an array of numbers"
         if not good:
@@ -385,7 +408,7 @@ def _decode_value(value: Any, path: str) -> Any:
 
 
 def _array(values: Any, dtype: Any, path: str, shown: Any) -> np.ndarray[Any, Any]:
-    """The array of a table of `dtype` and `values`, each of which has to be a number of that kind already."""
+    """Returns the array of a table of `dtype` and `values`; the values must be numbers of that kind already."""
     try:
         given = np.asarray(values)
         named = np.dtype(dtype) if isinstance(dtype, str) else None
@@ -404,7 +427,7 @@ def _array(values: Any, dtype: Any, path: str, shown: Any) -> np.ndarray[Any, An
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object's table, in which a key may stand once, as in TOML."""
+    """Returns a JSON object as a table and refuses duplicate keys, as TOML does."""
     table = dict(pairs)
     if len(table) < len(pairs):
         raise ValueError("a key is given twice in one table: " + ", ".join(key for key, _ in pairs))
@@ -412,7 +435,7 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _numbers(data: Any) -> Any:
-    """Undoes what `_plain` did to non-finite numbers."""
+    """Restores the non-finite numbers that `_plain` converted to strings."""
     if isinstance(data, dict):
         return {key: _numbers(value) for key, value in data.items()}
     if isinstance(data, list):

@@ -1,10 +1,10 @@
-"""Frozen dataclasses that JAX can take apart, with units and ranges declared beside each field.
+"""Frozen dataclasses registered with JAX as pytrees, with unit and range declared beside each field.
 
 A class decorated with `pytree` is an immutable dataclass whose fields are JAX leaves or hold such classes; a choice,
-such as a gate's kind, is a class of its own. What a user constructs is checked against the declared ranges; what JAX
-rebuilds is not, because JAX fills the leaves with tracers, `None`, axis numbers and zeros of an optimiser. A rollout
-checks what it is given once more. The same declarations feed the command line's
-options, the files' keys and the documentation, so that a parameter is described in one place.
+such as a gate's kind, is a class of its own. Values that a user passes to a constructor are checked against the
+declared ranges; values with which JAX rebuilds a tree are not, because JAX fills the leaves with tracers, `None`, axis
+numbers and zeros of an optimiser. A rollout checks its arguments once more. The command line's options, the files' keys
+and the documentation use the same declarations, so that a parameter is described in one place.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ import numpy as np
 from cpjax.errors import InputError
 
 Array: TypeAlias = jax.Array | np.ndarray[Any, Any]
-"""What JAX takes as an array. Classes hold NumPy arrays until a rollout casts them: no backend starts before."""
+"""An array that JAX accepts. Classes hold NumPy arrays until a rollout casts them: no JAX backend starts before."""
 
 Scalar: TypeAlias = Array | float
 """One real number: a Python float, or an array of shape () that JAX may trace. Batches appear only under `vmap`."""
@@ -34,21 +34,22 @@ _RULE = "cpjax"  # key of a field's declaration in dataclasses' metadata
 
 @dataclasses.dataclass(frozen=True)
 class Number:
-    """Declaration of a real-valued field: all that other modules need to know of the parameter.
+    """Declaration of a real-valued field, with everything that other modules need about the parameter.
 
     Attributes:
-      unit: in SI, as text.
-      help: one line.
-      above, at_least, below, at_most: the open or closed ends of the range.
+      unit: SI unit, as text.
+      help: description in one line.
+      above, at_least, below, at_most: open (`above`, `below`) or closed ends of the range.
       infinite: whether an infinity is allowed.
-      typical: size at which the parameter matters; used where its value is zero, as a share of zero is zero. 1 in the
-        parameter's unit if not declared.
-      linear: whether the linear model about upright may depend on it: audits of printed gains let it change.
-      uncertain: whether a rig's owner does not know it well: `sample_plants` draws it, audits of gradients vary it.
-      drawn: where an uncertain one is zero, its spread is a share of this; `typical` if not declared.
-      change: where it is zero, what an audit of gradients counts as a whole change; `typical` if not declared.
+      typical: size at which the parameter matters; used as its scale where its value is zero, because a share of zero
+        is zero. 1 in the parameter's unit if not declared.
+      linear: whether the linear model about upright may depend on it; audits of printed gains vary such parameters.
+      uncertain: whether its value is uncertain on a real rig: `sample_plants` draws it at random, and audits of
+        gradients vary it.
+      drawn: where the value of an uncertain one is zero, its spread is a share of this; `typical` if not declared.
+      change: where its value is zero, the change that audits of gradients take as its scale; `typical` if not declared.
       neutral: value at which the plant moves as if it had no such parameter. A bridge that cannot express the
-        parameter refuses any other.
+        parameter refuses any other value.
     """
 
     unit: str
@@ -66,18 +67,23 @@ class Number:
     neutral: float = 0.0
 
     def size(self, owner: Any, use: Literal["typical", "drawn", "change"] = "typical") -> float:
-        """What stands for the parameter's size in `owner` where its value is zero."""
+        """Returns the scale of the parameter where its value is zero, in the parameter's unit.
+
+        Args:
+          owner: argument of a `Size` that is a function: the component, or the plant for a motor's parameter.
+          use: the declared size; without one of its own it is `typical`.
+        """
         own = getattr(self, use)
         size = self.typical if own is None else own
         return 1.0 if size is None else float(size(owner) if callable(size) else size)
 
     @property
     def scales(self) -> bool:
-        """Whether the range holds every positive number, so that a value may be multiplied by any factor."""
+        """Whether the range contains every positive number, so that a value may be multiplied by any positive factor."""
         return max(self.above, self.at_least) <= 0.0 and min(self.below, self.at_most) == math.inf
 
     def allowed(self) -> str:
-        """The range in words, as error messages and `--help` print it."""
+        """Returns the range in words, as error messages and `--help` print it."""
         ends = [
             f"above {self.above:g}" if self.above > -math.inf else "",
             f"at least {self.at_least:g}" if self.at_least > -math.inf else "",
@@ -95,7 +101,7 @@ class Number:
                 value = float(value)
             except OverflowError as problem:
                 raise InputError(name, value, self.allowed()) from problem
-        if isinstance(value, float):  # every call of a rollout looks at dozens: without NumPy, for its speed
+        if isinstance(value, float):  # a rollout checks dozens of floats per call: faster without NumPy
             good = self._holds(value)
         else:
             numbers = _concrete_reals(name, value, self)
@@ -105,9 +111,9 @@ class Number:
         return value
 
     def _holds(self, v: Any) -> Any:
-        """Whether a float, or each number of an array, is in the range."""
+        """Returns whether a float, or each number of an array, is in the range."""
         real = v == v if self.infinite else abs(v) < math.inf
-        # A closed end, such as pi, is still allowed after a rounding to float32.
+        # A closed end such as pi stays allowed after rounding to float32.
         low, high = self.at_least - 1e-6 * abs(self.at_least), self.at_most + 1e-6 * abs(self.at_most)
         inside = ((v > self.above) | (self.above == -math.inf)) & ((v < self.below) | (self.below == math.inf))
         return real & inside & (v >= low) & (v <= high)
@@ -136,7 +142,7 @@ class Matrix:
         if not hasattr(value, "shape"):
             raise InputError(name, value, self.allowed())
         if self.shape[0] == 1 and len(self.shape) > 1 and _fits(value.shape, self.shape[1:]):
-            value = value.reshape((1, *value.shape))  # a plain row is welcome where a one-row matrix is meant
+            value = value.reshape((1, *value.shape))  # a vector is accepted for a one-row matrix
         if not _fits(value.shape[-len(self.shape) :], self.shape):
             raise InputError(name, f"array of shape {value.shape}", self.allowed())
         numbers = _concrete_reals(name, value, self)
@@ -150,7 +156,7 @@ class Matrix:
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """Declaration of a field that holds another component: one with all of the named methods or attributes."""
+    """Declaration of a field that holds another component, which must have all methods and attributes in `needs`."""
 
     help: str
     needs: tuple[str, ...]
@@ -166,17 +172,17 @@ Rule: TypeAlias = Number | Matrix | Part
 
 
 def number(unit: str, help: str, *, default: Any = dataclasses.MISSING, **more: Any) -> Any:
-    """A real-valued field. `more` are the remaining attributes of `Number`."""
+    """Declares a real-valued field; `more` are the remaining attributes of `Number`."""
     return dataclasses.field(default=default, metadata={_RULE: Number(unit, help, **more)})
 
 
 def matrix(shape: tuple[int | None, ...], unit: str, help: str, *, symmetric: bool = False) -> Any:
-    """An array-valued field (see `Matrix`)."""
+    """Declares an array-valued field (see `Matrix`)."""
     return dataclasses.field(metadata={_RULE: Matrix(shape, unit, help, symmetric)})
 
 
 def part(help: str, *needs: str, default: Any = dataclasses.MISSING, default_factory: Any = dataclasses.MISSING) -> Any:
-    """A field that holds another component (see `Part`)."""
+    """Declares a field that holds another component, which must have the attributes `needs` (see `Part`)."""
     rule = {_RULE: Part(help, needs)}
     if default_factory is not dataclasses.MISSING:
         return dataclasses.field(default_factory=default_factory, metadata=rule)
@@ -184,12 +190,12 @@ def part(help: str, *needs: str, default: Any = dataclasses.MISSING, default_fac
 
 
 def rules(cls: type) -> dict[str, Rule]:
-    """The declarations of a `pytree` class, by field name, in order; not to be changed."""
+    """Returns the declarations of a `pytree` class, by field name, in order; the dictionary must not be changed."""
     return _rules(cls)
 
 
 def numbers(*classes: type) -> dict[str, Number]:
-    """The declared numbers of `pytree` classes, by field name, in order; other classes declare none."""
+    """Returns the declared numbers of `pytree` classes, by field name, in order; other classes contribute none."""
     known = [cls for cls in classes if dataclasses.is_dataclass(cls)]
     return {name: rule for cls in known for name, rule in rules(cls).items() if isinstance(rule, Number)}
 
@@ -201,7 +207,7 @@ def _rules(cls: Any) -> dict[str, Rule]:
 
 @dataclass_transform(frozen_default=True, kw_only_default=False, field_specifiers=(number, matrix, part))
 def pytree(cls: type[T]) -> type[T]:
-    """Class decorator: frozen dataclass, registered with JAX, checked when a user constructs it.
+    """Makes a class a frozen dataclass that is registered with JAX and checked when a user constructs it.
 
     Raises (from the constructor):
       InputError: a concrete value outside its declared range, not a number, or of the wrong shape or dtype.
@@ -214,7 +220,7 @@ def pytree(cls: type[T]) -> type[T]:
         if own_check is not None:
             own_check(self)
 
-    cls.__post_init__ = post_init  # type: ignore[attr-defined]  # mypy knows no attribute added to a class
+    cls.__post_init__ = post_init  # type: ignore[attr-defined]  # mypy does not see attributes added to a class
     # Equality stays identity: comparing fields that hold arrays has no single truth value.
     made: Any = dataclasses.dataclass(frozen=True, eq=False)(cls)
     names = [field.name for field in dataclasses.fields(made)]
@@ -241,26 +247,28 @@ def pytree(cls: type[T]) -> type[T]:
 
 
 def is_traced(value: Any) -> bool:
-    """Whether JAX is tracing through `value`, so that it has no number to look at."""
+    """Returns whether JAX is tracing `value`, so that it has no concrete number to check."""
     return isinstance(value, jax.core.Tracer)
 
 
 def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
-    """Refuses a component that no rollout can run: JAX may have rebuilt it with anything.
+    """Refuses a component that no rollout can run, because JAX may have rebuilt it with arbitrary leaves.
 
-    Fields with a declared rule, and those annotated as `Scalar`, are held against it. All else that a component of a
-    user's own holds (arrays of any shape, trees of them, functions) is taken as it is; of random keys
-    (`jax.random.key`) there may be one for each start.
+    Fields with a declared rule, and those annotated as `Scalar`, are checked against it. Everything else that a user's
+    own component holds (arrays of any shape, trees of them, functions) is accepted as it is; random keys
+    (`jax.random.key`) may come as one for each initial state.
 
     Args:
+      name: the component's name in error messages.
+      tree: a component, or a tree of components and numbers.
       batch: how many components the tree may hold: declared fields may have a leading axis of this length.
 
     Returns:
-      For each number among the leaves whether it has that axis.
+      For each number among the leaves, in order, whether it has that axis.
 
     Raises:
-      InputError: a leaf that is neither a number nor a choice (a function, a text), a number or matrix with another
-        axis in front (which only `vmap` may take away), or a concrete one outside its declared range.
+      InputError: a leaf that is neither a number nor a choice (a function, a text), a number or matrix with an extra
+        leading axis (which only `vmap` may remove), or a concrete one outside its declared range.
     """
     if is_component(tree):
         return _check_fields(name, tree, batch)
@@ -281,16 +289,16 @@ def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
 
 
 def is_component(node: Any) -> bool:
-    """Whether `node` is an instance of a class made by `pytree`."""
+    """Returns whether `node` is an instance of a class made by `pytree`."""
     return type(node) in _COMPONENTS
 
 
 _COMPONENTS: dict[type, tuple[str, ...]] = {}
-"""Classes made by `pytree`, and their fields that hold one number each without declaring more."""
+"""Classes made by `pytree`, with the names of their fields that hold one number each and declare no range."""
 
 
 def is_number(leaf: Any) -> bool:
-    """Whether a leaf of a tree is a number, or an array of them."""
+    """Returns whether a leaf of a tree is a number or an array of numbers."""
     return isinstance(leaf, (int, float)) or hasattr(leaf, "dtype")
 
 
@@ -327,7 +335,7 @@ def _is_leaf(value: Any) -> bool:
 
 
 def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
-    """Whether a shape is the expected one, in which None stands for any length."""
+    """Returns whether a shape matches the expected one, in which None stands for any length."""
     if shape == expected:
         return True
     return len(shape) == len(expected) and all(
@@ -336,7 +344,7 @@ def _fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
 
 
 class Hidden:
-    """A leaf that is no number (a function, a text), as a pytree without leaves: it is part of what is compiled."""
+    """A non-numeric leaf (a function, a text) as a pytree without leaves, so that it is static under `jit`."""
 
     def __init__(self, value: Any) -> None:
         self.value = value
@@ -346,7 +354,7 @@ jax.tree_util.register_pytree_node(Hidden, lambda node: ((), node.value), lambda
 
 
 class KeyData:
-    """A typed random key (`jax.random.key`) as the numbers that it is made of, which NumPy can hold."""
+    """A typed random key (`jax.random.key`) as its raw integers, which NumPy can hold."""
 
     def __init__(self, data: Any, kind: str) -> None:
         self.data, self.kind = data, kind
@@ -360,7 +368,7 @@ def _is_key(leaf: Any) -> bool:
 
 
 def hide(tree: T) -> T:
-    """Returns the tree with leaves that are no numbers hidden from JAX."""
+    """Returns the tree with its non-numeric leaves hidden from JAX (see `Hidden`)."""
     leaves, structure = jax.tree.flatten(tree)
     if all(is_number(leaf) for leaf in leaves):
         return tree
@@ -369,10 +377,15 @@ def hide(tree: T) -> T:
 
 
 def as_arguments(name: str, tree: T, dtype: Any) -> T:
-    """Returns the tree as JAX can trace it: numbers cast to `dtype` (see `cast`), other leaves hidden, keys as numbers.
+    """Converts a tree to what JAX can trace: numbers as by `cast`, random keys as integers, other leaves hidden.
+
+    Args:
+      name: the component's name in error messages.
+      tree: a component, or a tree of components and numbers.
+      dtype: floating-point dtype of the real numbers.
 
     Raises:
-      InputError: a leaf that is no number cannot be hashed.
+      InputError: a non-numeric leaf that cannot be hashed.
     """
 
     def convert(leaf: Any) -> Any:
@@ -391,7 +404,7 @@ def as_arguments(name: str, tree: T, dtype: Any) -> T:
 
 
 def reveal(tree: T) -> T:
-    """Returns the tree with what `hide` or `as_arguments` has hidden."""
+    """Restores the leaves and random keys that `hide` or `as_arguments` has wrapped."""
 
     def show(node: Any) -> Any:
         if isinstance(node, KeyData):
@@ -403,7 +416,7 @@ def reveal(tree: T) -> T:
 
 
 def cast(tree: T, dtype: Any) -> T:
-    """Returns the tree with every real leaf as an array of `dtype`; integers and booleans stay what they are.
+    """Returns the tree with every real leaf as an array of `dtype`; integers and booleans are unchanged.
 
     Traced leaves are converted too, with their derivatives.
     """
@@ -417,8 +430,10 @@ def _cast(leaf: Any, dtype: Any) -> Any:
 
 
 def as_array(value: Any, dtype: Any) -> Array:
-    """As JAX's `asarray`, but what JAX does not have yet stays with NumPy, and what is as asked is not touched: a
-    rollout is called with dozens of numbers, and this takes a tenth of the time."""
+    """Converts a value like `jnp.asarray`, but keeps values from outside JAX in NumPy and returns matching arrays as is.
+
+    A rollout is called with dozens of numbers, and this takes a tenth of the time.
+    """
     if not isinstance(value, jax.Array):
         return np.asarray(value, dtype=dtype)
     ready = value.dtype == dtype and not value.weak_type
@@ -426,10 +441,10 @@ def as_array(value: Any, dtype: Any) -> Array:
 
 
 def _from_list(name: str, value: Any, allowed: str) -> np.ndarray[Any, Any]:
-    """A nested list of Python numbers as a float array."""
+    """Converts a nested list of Python numbers to a float array."""
     try:
         array = np.asarray(value)
-        if array.dtype.kind not in "fiu":  # not text, booleans, complex numbers, or an uneven nesting
+        if array.dtype.kind not in "fiu":  # rejects text, booleans, complex numbers, uneven nesting
             raise ValueError
         return array.astype(np.float64)
     except (TypeError, ValueError, OverflowError) as problem:
@@ -446,7 +461,7 @@ def _holds_tracers(value: Any) -> bool:
 
 
 def _concrete_reals(name: str, value: Any, rule: Number | Matrix) -> np.ndarray | None:
-    """`value` as a float array, or None where it is traced and cannot be looked at."""
+    """Returns `value` as a float array, or None where it is traced and has no concrete numbers."""
     if is_traced(value):
         return None
     dtype = getattr(value, "dtype", None)

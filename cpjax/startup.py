@@ -1,7 +1,7 @@
-"""What the process of the command line needs before the imports that take a second. In any other process: nothing.
+"""Setup of the command line's process before the imports that take a second; without effect in any other process.
 
-The shell's `cpjax` and `python -m cpjax` import this package before a line of the command line's own code can run. So
-its first import is this module.
+The shell's `cpjax` and `python -m cpjax` import this package before any line of the command line's own code can run.
+Therefore the package's first import is this module.
 """
 
 import os
@@ -12,44 +12,44 @@ from typing import Any
 
 
 def is_command() -> bool:
-    """Whether this process is the command line: `cpjax`, or `python -m cpjax`."""
+    """Returns whether this process is the command line: `cpjax`, or `python -m cpjax`."""
     name = getattr(sys, "argv", [""])[0]  # while Python looks for the module of its -m, this is "-m"
     return os.path.splitext(os.path.basename(name))[0] == "cpjax" or (name == "-m" and "cpjax" in sys.orig_argv)
 
 
 def prepare() -> None:
-    """Ends an interrupted import without a traceback, opens closed standard streams, and quiets XLA's alarm."""
+    """Makes an interrupted import end without a traceback, opens closed standard streams, and silences XLA's log."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end)
-    # The next file that is opened would get the number of a closed stream, and what libraries print would go into it.
+    # The next file that is opened would get the descriptor of a closed stream, and libraries would print into it.
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)
-    # "Very slow compile?" is logged as an error, between the lines of a progress that says the same better. What fails
-    # in XLA raises an exception besides. JAX reads this when it is imported; who has set it wants to see more.
+    # XLA logs "Very slow compile?" as an error, in the middle of the progress display, which shows the same more
+    # clearly; real failures also raise an exception. JAX reads this when it is imported; a value set by the user stays.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
 def ready() -> None:
-    """Hands interrupts back to Python, which raises KeyboardInterrupt for them: the imports are done."""
+    """Restores Python's interrupt handling, which raises KeyboardInterrupt, once the imports are done."""
     if signal.getsignal(signal.SIGINT) is _end:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.unraisablehook = _again
 
 
 def _again(unraisable: Any) -> None:
-    """Interrupts once more where Python has dropped the interrupt, in a callback of the garbage collector for one."""
+    """Repeats an interrupt that Python has dropped, for example in a callback of the garbage collector."""
     if unraisable.exc_type is KeyboardInterrupt:
-        # Later, from elsewhere: at once it would be dropped again.
+        # After a delay and from another thread: raised at once, it would be dropped again.
         threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
     else:
         sys.__unraisablehook__(unraisable)
 
 
 def _end(*_: Any) -> None:
-    os._exit(130)  # nothing has been written yet, and half of an import is not fit to clean up
+    os._exit(130)  # nothing has been written yet, and a half-imported package cannot clean up
 
 
 if is_command():

@@ -3,7 +3,7 @@
     python experiments/tune_baselines.py
 
 Each minimises the mean settling time of 192 starts (5 s, a control held over 4 ms; a failure counts 5 s), with 2,240
-evaluations, from the bland start, for both designs. CMA-ES comes from the package cma (the extra "baselines").
+evaluations, from the baseline, for both designs. CMA-ES comes from the package cma (the extra "baselines").
 """
 
 import itertools

@@ -4,7 +4,7 @@
 
 Each tuned law is evaluated as docs/protocol.md says, from exact rest too, at a quarter of the step, and on the
 continuous clock with located switching. A finished tuning is kept in the folder and not done again. Of the five seeds
-from the bland beginning the controller with the best score of its own, on starts of its own, is copied to
+from the baseline the controller with the best score of its own, on starts of its own, is copied to
 tuned_lqr.json and tuned_place.json: the controllers that ship.
 """
 
@@ -29,7 +29,7 @@ from cpjax.study.summary import summarise
 from cpjax.tune.config import TuningConfig
 from cpjax.tune.parameters import free_parameters
 
-CASES = (("appendix", "bland", 5), ("appendix", "paper", 5), ("identified", "bland", 1))
+CASES = (("appendix", "baseline", 5), ("appendix", "paper", 5), ("identified", "baseline", 1))
 
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:

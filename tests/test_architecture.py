@@ -119,3 +119,22 @@ def test_every_public_name_has_a_docstring_of_its_own():
 
 def test_every_module_says_what_it_is_for():
     assert [str(p) for p in SOURCES if not ast.get_docstring(ast.parse(p.read_text()))] == []
+
+
+def test_a_tests_name_has_at_most_80_characters():
+    names = [
+        name
+        for path in (ROOT.parent / "tests").rglob("test_*.py")
+        for name in re.findall(r"def (test_\w+)", path.read_text())
+    ]
+    assert [name for name in names if len(name) > 80] == []
+
+
+def test_no_docstring_begins_with_of_or_what():
+    found = [
+        f"{path.relative_to(ROOT)}: {line.strip()}"
+        for path in SOURCES
+        for line in path.read_text().splitlines()
+        if re.match(r'\s*"""(Of|What)\b', line)
+    ]
+    assert found == []

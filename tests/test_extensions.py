@@ -261,7 +261,7 @@ def test_the_furuta_pendulum_follows_from_its_lagrangian():
         np.testing.assert_allclose(FURUTA.accelerations(tuple(q), tuple(v), u), expected, rtol=1e-9)
 
 
-def test_a_furuta_pendulum_swings_up_is_caught_and_its_located_gradient_is_that_of_differences():
+def test_a_furuta_pendulum_is_caught_and_its_located_gradient_is_that_of_differences():
     def outside(p):
         plant = dataclasses.replace(FURUTA, pole_length=p[2], torque_per_voltage=p[3])
         settings = {**CAUGHT, "switching": "located", "metrics": furuta.FurutaTimeOutside()}

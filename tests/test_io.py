@@ -645,7 +645,7 @@ def test_a_claim_alone_in_its_folder_gives_way(tmp_path):
     assert json.loads((tmp_path / "parts" / "request.json").read_text()) == {"seed": 2}
 
 
-def test_a_removal_that_is_stopped_leaves_nothing_that_a_claim_could_take_for_its_parts(tmp_path, monkeypatch):
+def test_a_stopped_removal_leaves_nothing_that_a_claim_could_take_for_its_parts(tmp_path, monkeypatch):
     folder = tmp_path / "parts"
     io.claim(folder / "request.json", {"seed": 1})
     (folder / "first").write_text("done")

@@ -155,7 +155,7 @@ def test_mujocos_model_refuses_a_plant_or_motor_of_another_class_by_its_name():
 
 
 @pytest.mark.parametrize("float64", [True, False])
-def test_a_plant_written_with_jaxs_functions_moves_in_python_control_in_floats_and_as_it_should(float64):
+def test_a_plant_of_jax_functions_moves_in_python_control_in_floats(float64):
     motor = as_class(MotorWithDryBearings, ROUGH.motor, dry_friction=0.4)
     plant = as_class(CartPoleWithDrag, dataclasses.replace(ROUGH, motor=motor), drag=0.7)
     state, voltage = State(0.1, 1.5, 0.4, -2.0), 5.0
@@ -261,7 +261,7 @@ np.testing.assert_allclose(swept.cart_travel, np.max(np.abs(slowed.x)), rtol=1e-
 """
 
 
-def test_a_parameter_added_to_the_source_by_one_declaration_and_one_term_works_everywhere(tmp_path):
+def test_a_parameter_added_by_one_declaration_and_one_term_works_everywhere(tmp_path):
     source = Path(cpjax.__file__).parent
     shutil.copytree(source, tmp_path / "cpjax", ignore=shutil.ignore_patterns("__pycache__"))
     plant = tmp_path / "cpjax" / "plant" / "cartpole.py"

@@ -17,9 +17,7 @@ def stop(*_, **__):
     raise KeyboardInterrupt
 
 
-def test_basin_writes_maps_whose_shares_are_those_of_the_runs_beside_them_also_after_an_interruption(
-    command, tmp_path, monkeypatch
-):
+def test_basin_writes_maps_with_the_shares_of_their_runs_after_an_interruption_too(command, tmp_path, monkeypatch):
     odd = str(tmp_path / r"a $\frac$ [bold] <b>.json")  # a formula, a style or a tag, if anything takes it for one
     cpjax.save(odd, cpjax.preset("placement"))
     arguments = ("--cells", 6, "--theta", -1, 1, "--controllers", odd, "corrected/lqr", "--duration", 3)

@@ -238,7 +238,7 @@ def test_eval_shape_of_a_rollout_has_the_shapes_and_types_of_the_rollout():
         assert (shape.shape, shape.dtype) == (leaf.shape, leaf.dtype)
 
 
-def test_a_float32_start_makes_the_whole_rollout_float32_and_close_to_the_float64_one():
+def test_a_float32_start_makes_the_rollout_float32_and_close_to_float64():
     plant, controller, start = (jax.tree.map(jnp.float32, tree) for tree in (PLANT, HYBRID, START))
     narrow = rollout(plant, controller, start, **RUN)
     wide = rollout(PLANT, HYBRID, START, **RUN)

@@ -1,4 +1,4 @@
-"""All that exists only to make XLA's compiler for CPUs fast; results do not depend on it but in their last bits.
+"""Code whose only purpose is speed with XLA's CPU compiler; it changes results in their last bits at most.
 
-Each part, its measured gain, its cause and how to switch it off: docs/performance.md.
+docs/performance.md describes each part and its effect.
 """

@@ -1,6 +1,6 @@
-"""The larger and the smaller of two numbers, in one instruction.
+"""Maximum and minimum of two numbers in one processor instruction.
 
-`jnp.maximum` returns NaN if either is NaN, for which processors take three instructions; these ask only what one does.
+`jnp.maximum` returns NaN if either number is NaN, which takes three instructions; these functions do not.
 """
 
 import jax
@@ -11,13 +11,13 @@ from cpjax.pytree import Scalar
 
 @jax.custom_jvp
 def fast_maximum(a: Scalar, b: Scalar) -> jax.Array:
-    """The larger of the two, b where either is NaN. The derivative is that of `jnp.maximum`: half each where equal."""
+    """Returns max(a, b), or b where either is NaN; the derivative is that of `jnp.maximum`: 1/2 each where equal."""
     return jnp.where(a > b, a, b)
 
 
 @jax.custom_jvp
 def fast_minimum(a: Scalar, b: Scalar) -> jax.Array:
-    """The smaller of the two, b where either is NaN. The derivative is that of `jnp.minimum`: half each where equal."""
+    """Returns min(a, b), or b where either is NaN; the derivative is that of `jnp.minimum`: 1/2 each where equal."""
     return jnp.where(a < b, a, b)
 
 

@@ -1,15 +1,15 @@
-"""How JAX is to use a CPU: its cores as devices, and two options of XLA's compiler.
+"""Configuration of JAX for CPUs: cores as devices, and two options of XLA's compiler.
 
-By default XLA's CPU compiler makes several functions of one step of a simulation, computes what they share in each, and
-calls them one after the other: most of the time goes there. What `backend/single_kernel.py` does about it needs no
-options, but for values two of the compiler's do more:
+By default XLA's CPU compiler splits one step of a simulation into several functions, recomputes shared results in each,
+and calls them one after the other, which takes most of the time. `backend/single_kernel.py` avoids this without
+options, but two compiler options are more effective for values (not for gradients):
 
     xla_cpu_use_multi_output_fusion          what several results need is computed once
     xla_cpu_small_while_loop_byte_threshold  a whole loop becomes one function
 
-They are not documented by XLA and have to be set before JAX starts, so a library cannot set them behind a user's back:
-`configure_cpu` does on request, and the command line does so for itself. They change speed, and results in the last
-bits. With a jaxlib that they were not tested with they are left out, and everything works without them.
+XLA does not document them, and they must be set before JAX starts, so a library should not set them unasked:
+`configure_cpu` sets them on request, and the command line sets them for itself. They change speed, and results in the
+last bits. With an untested jaxlib they are left out, and everything works without them.
 """
 
 import functools
@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from cpjax.errors import InputError, PerformanceWarning
 
 TESTED = ("0.10.2",)
-"""The versions of jaxlib with which the options were tested."""
+"""Versions of jaxlib with which the options were tested."""
 
 _CONFIG: Any = jax.config  # its attributes have no annotations
 
@@ -36,23 +36,24 @@ _FLAG = "--xla_backend_extra_options"
 
 
 def configure_cpu(devices: int | None = None, *, gradients: bool = False) -> bool:
-    """Makes simulations of many starts on a CPU fast. Call it before JAX computes anything, once.
+    """Configures JAX for fast simulations of many initial states on a CPU.
 
-    By default it is for values: gradients are slower after it, those through a trajectory much slower
-    (docs/performance.md).
+    Call it once, before JAX computes anything. By default it optimises values: gradients become slower, those through a
+    trajectory much slower (docs/performance.md).
 
     Args:
-      devices: as how many devices the CPU is to appear, which `sweep` shares its starts out to; by default as many as
-        there are cores that this process may use.
-      gradients: for a process that computes both. The cores become devices, and the compiler keeps its own options.
+      devices: number of devices that the CPU appears as, among which `sweep` divides its initial states; by default
+        the number of cores that this process may use.
+      gradients: for a process that computes values and gradients. The cores become devices, and the compiler keeps its
+        own options.
 
     Returns:
-      Whether the compiler's options were set: not for gradients, with another jaxlib than the tested ones, or where
-      XLA_FLAGS has options of this kind already.
+      Whether the compiler's options were set. They are not with `gradients`, with an untested jaxlib, or where
+        XLA_FLAGS has options of this kind already.
 
     Raises:
-      InputError: `devices` below 1.
-      RuntimeError: JAX has started already, so that nothing can be set any more.
+      InputError: `devices` is not a whole number of at least 1.
+      RuntimeError: JAX has already started and can no longer be configured.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     devices = cores if devices is None else devices
@@ -62,7 +63,7 @@ def configure_cpu(devices: int | None = None, *, gradients: bool = False) -> boo
     try:
         if "xla_force_host_platform_device_count" not in flags:
             _CONFIG.update("jax_num_cpu_devices", devices)
-        else:  # which of the two holds is then XLA_FLAGS; this only asks whether JAX has started
+        else:  # XLA_FLAGS takes precedence; this only tests whether JAX has started
             _CONFIG.update("jax_num_cpu_devices", _CONFIG.jax_num_cpu_devices)
     except RuntimeError as problem:
         message = "configure_cpu is too late: JAX has started. Call it before anything is computed with JAX"
@@ -74,15 +75,16 @@ def configure_cpu(devices: int | None = None, *, gradients: bool = False) -> boo
 
 
 def keep_compilations() -> Path | None:
-    """Has JAX keep on disk what it compiles, so that the next process need not; returns where, or None if it cannot.
+    """Makes JAX cache compiled code on disk for later processes; returns the folder, or None if that is impossible.
 
-    In the user's cache folder ($XDG_CACHE_HOME or ~/.cache), unless JAX's own settings name another or forbid it.
+    The folder is in the user's cache folder ($XDG_CACHE_HOME or ~/.cache), unless JAX's own settings name another or
+    disable the cache.
     """
     folder = _CONFIG.jax_compilation_cache_dir
     if not _CONFIG.jax_enable_compilation_cache:
         return None
     if folder is None:
-        # Compiled code is for one kind of CPU; a home may be seen by several.
+        # Compiled code is specific to one kind of CPU, and several kinds may share a home folder.
         kind = hashlib.sha256(_cpu().encode()).hexdigest()[:12]
         cache = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
         folder = os.path.join(cache, "cpjax", kind)
@@ -102,7 +104,7 @@ def keep_compilations() -> Path | None:
 
 
 def _cpu() -> str:
-    """What tells this CPU's instructions from another's."""
+    """Returns a text that identifies the instruction set of this CPU."""
     try:
         with open("/proc/cpuinfo") as lines:
             flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
@@ -113,21 +115,21 @@ def _cpu() -> str:
 
 @functools.cache
 def compiler_fuses_loops() -> bool:
-    """Whether the compiler makes one function of a small loop; starts JAX. It is asked by compiling one."""
+    """Returns whether XLA compiles a small loop as one function, found by compiling one; starts JAX."""
     if jax.default_backend() != "cpu":
         return False
 
     def loop(x: jax.Array) -> jax.Array:
         return jax.lax.fori_loop(0, 8, lambda _, y: jnp.sin(y) + y, x)
 
-    # 64 KiB: by default only loops over less than 1 KiB are made one function.
+    # 64 KiB: by default only loops over less than 1 KiB become one function.
     text = jax.jit(loop).lower(jnp.zeros((1 << 14,), jnp.float32)).compile().as_text() or ""
     return "xla_cpu_small_call" in text
 
 
 @functools.cache
 def jaxlib_is_tested() -> bool:
-    """Whether jaxlib is a version with which all that XLA does not document was tested. Warns, once, if it is not."""
+    """Returns whether this version of jaxlib was tested with the undocumented features used here; warns once if not."""
     tested = version("jaxlib") in TESTED
     if not tested:
         message = (
@@ -139,6 +141,6 @@ def jaxlib_is_tested() -> bool:
 
 
 def compiler_options(platform: str) -> dict[str, Any]:
-    """Options for `jax.jit` of a function that simulates a batch."""
-    # The widest vectors that the CPU has; by default LLVM keeps to half of AVX-512's.
+    """Returns the options for `jax.jit` of a function that simulates a batch on `platform`."""
+    # The widest vectors of the CPU; by default LLVM uses only half the width of AVX-512.
     return {"xla_cpu_prefer_vector_width": 512} if platform == "cpu" else {}

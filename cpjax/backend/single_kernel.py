@@ -1,13 +1,13 @@
-"""How XLA's compiler for CPUs is told what to make one function of.
+"""Marks that make XLA's CPU compiler compile a whole loop as a single kernel.
 
-By default it makes many small functions of one step of a simulation and calls them one by one at every step, which
-takes longer than the arithmetic. `single_kernel` ends that: a whole loop becomes one function. In that function several
-results with a common part each compute it for themselves, unless the part is a function too: `outline`. (With the
-options that `cpjax.configure_cpu` sets, the compiler does both better by itself, and nothing is done here.)
+By default it splits one step of a simulation into many small functions and calls them one by one at every step, which
+takes longer than the arithmetic. `single_kernel` makes the whole loop one function. In that function several results
+with a common part each recompute it, unless the part is a function of its own: `outline`. (With the options that
+`cpjax.configure_cpu` sets, the compiler does both better by itself, and nothing is done here.)
 
-Both put attributes on the call of one `jax.jit` inside another. XLA does not document them: they are put there only
-for versions of jaxlib that they were tested with, and only around operations that they were tested with, which leaves
-out calls into other libraries (a solver, a callback). Only speed depends on them, and the last bits of results.
+Both set attributes on the call of one `jax.jit` inside another. XLA does not document these attributes: they are set
+only for versions of jaxlib and around operations that they were tested with, which excludes calls into other libraries
+(a solver, a callback). Only speed depends on them, and the last bits of results.
 """
 
 import functools
@@ -26,7 +26,7 @@ from cpjax.errors import PerformanceWarning
 from cpjax.pytree import hide, reveal
 
 LARGEST = 1 << 14
-"""Above so many numbers in a result, each operation of a loop is shared out to the cores, which is JAX's own way."""
+"""Largest number of elements in a result of a marked call. Above it, XLA divides each operation among the cores."""
 
 _ALLOWED = """
 func.func func.call func.return stablehlo.return stablehlo.while stablehlo.case stablehlo.if stablehlo.reduce
@@ -41,28 +41,29 @@ stablehlo.select stablehlo.shift_left stablehlo.shift_right_arithmetic stablehlo
 stablehlo.sign stablehlo.sine stablehlo.slice stablehlo.sqrt stablehlo.subtract stablehlo.tan stablehlo.tanh
 stablehlo.transpose stablehlo.xor
 """
-"""Those operations that the compiler can write into one function."""
+"""Operations that the compiler can combine into one function."""
 
 
 def single_kernel(function: Callable[..., Any], *, stacks: bool = False) -> Callable[..., Any]:
-    """`function`, compiled as one function on a CPU: forward, and in each pass of a derivative.
+    """Wraps `function` so that it is compiled as one kernel on a CPU: forward, and in each pass of a derivative.
 
-    To be called under `jax.jit`, with all that is differentiated among the arguments.
+    Call the result under `jax.jit`, with everything that is differentiated among the arguments.
 
     Args:
-      stacks: the function returns a pair, whose second part is stacked by a loop, and may be large.
+      function: a function of pytrees.
+      stacks: whether `function` returns a pair whose second part is stacked by a loop and may be large.
     """
     return function if runtime.compiler_fuses_loops() else _called(function, _whole, stacks)
 
 
 def outline(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function`, as a function of its own where the compiler would otherwise compute what it does several times."""
+    """Wraps `function` so that it stays a separate function where the compiler would otherwise recompute its results."""
     return function if runtime.compiler_fuses_loops() else _called(function, _part, False)
 
 
 class _Marks:
-    """Three identities. The first marks the call whose results it gets. The second, about a call's arguments, becomes
-    the third in a reverse pass: their cotangents are results of the call's transpose."""
+    """Three identity primitives. `results` marks the call whose results it receives. `arguments`, applied to a call's
+    arguments, becomes `cotangents` in a reverse pass, where the cotangents are results of the call's transpose."""
 
     def __init__(self, kind: str, mark: Callable[[Any, list[Any]], None]) -> None:
         self.results: Any = Primitive(f"results_of_{kind}")
@@ -93,7 +94,7 @@ def _called(function: Callable[..., Any], marks: _Marks, stacks: bool) -> Callab
 
 @functools.lru_cache(maxsize=256)
 def _revealed(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function`, of arguments that `hide` has been applied to. The same one each time, so that JAX traces it once."""
+    """Returns `function` for arguments wrapped by `hide`, cached so that JAX traces it once."""
 
     def revealed(*args: Any) -> Any:
         return function(*reveal(args))
@@ -129,7 +130,7 @@ def _define(primitive: Any, transpose: Any) -> None:
 
 def _mark_part(_: Any, owners: list[Any]) -> None:
     for owner in owners:
-        # XLA fails where it would share out the work of a function of one result to several cores.
+        # Only with several results: XLA fails where it would divide a marked function of one result among cores.
         if getattr(owner, "name", "") == "func.call" and len(owner.results) > 1:
             owner.attributes["mhlo.frontend_attributes"] = _attributes("inlineable")
 
@@ -153,10 +154,10 @@ def _mark_whole(symbols: Any, owners: list[Any]) -> None:
 
 
 def _move_body(function: Any, name: str, symbols: Any) -> None:
-    """Makes of the function one that calls another, marked one, which has its body.
+    """Moves the body of the function to a new, marked function, which the old one calls.
 
-    XLA fails on a marked function of which it simplifies an argument away. So the other returns its arguments too, and
-    a barrier hides which of them are constants.
+    XLA fails on a marked function if it simplifies an argument away. So the new function returns its arguments too, and
+    an optimisation barrier hides which of them are constants.
     """
     inner = function.operation.clone(ip=ir.InsertionPoint(function.operation))
     inner.attributes["sym_name"] = ir.StringAttr.get(name)
@@ -194,7 +195,7 @@ _SLOW = {
     "stablehlo.custom_call": "a call into another library (a solver, a callback)",
     "stablehlo.sort": "a sort",
 }
-"""Operations that a user's law may bring in, in words."""
+"""Unsupported operations that a user's law may contain, in words."""
 
 
 def _others(function: Any, symbols: Any) -> set[str]:

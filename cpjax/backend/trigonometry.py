@@ -1,6 +1,6 @@
-"""Sine and cosine together.
+"""Sine and cosine of one angle, computed together.
 
-A simulator asks for both functions of one angle at every stage. XLA's CPU backend evaluates each as a long, separate
+A simulator needs both functions of one angle at every stage. XLA's CPU backend evaluates each by a long, separate
 routine that it does not vectorise well; one shared range reduction and two short polynomials cost a fraction of that.
 """
 
@@ -45,9 +45,15 @@ _Pair: TypeAlias = tuple[jax.Array, jax.Array]
 
 @jax.custom_jvp
 def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
-    """Sine and cosine of `angle` [rad], any shape, float32 or float64; accurate to 2 ulp of 1 for |angle| <= 1e4.
+    """Computes sine and cosine of `angle`, accurate to 2 ulp of 1 for |angle| <= 1e4.
 
     The derivative rule is the exact one (cos, -sin), not that of the polynomials.
+
+    Args:
+      angle: [rad], any shape, float32 or float64.
+
+    Returns:
+      Sine and cosine, of the shape of `angle`.
     """
     angle = jnp.asarray(angle)
     angle = angle.astype(jnp.result_type(angle, float)) if not jnp.issubdtype(angle.dtype, jnp.floating) else angle
@@ -58,7 +64,7 @@ def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
 
 
 def _reduced(angle: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Sine and cosine of what is left of the angle beside whole quarters of a turn, and their number modulo 4."""
+    """Computes sine and cosine of the remainder of the angle to quarter turns, and the number of these modulo 4."""
     wide = angle.dtype == jnp.float64
     half_pi, sin_terms, cos_terms = (_HALF_PI_64, _SIN_64, _COS_64) if wide else (_HALF_PI_32, _SIN_32, _COS_32)
     turns = lax.round(angle * (2.0 / math.pi), lax.RoundingMethod.TO_NEAREST_EVEN)
@@ -78,13 +84,17 @@ def _sin_cos_jvp(primals: tuple[Scalar], tangents: tuple[jax.Array]) -> tuple[_P
 
 
 LARGEST_TURN = 0.1
-"""Up to which `rotate_by` is accurate [rad]."""
+"""Largest |angle| for which `rotate_by` is accurate [rad]."""
 
 
 def rotate_by(sin: jax.Array, cos: jax.Array, angle: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Sine and cosine of an angle that is `angle` [rad] beyond one whose sine and cosine are known.
+    """Computes sine and cosine of an angle increased by `angle`, from its sine and cosine before.
 
-    Accurate to 2 ulp of 1 for |angle| <= LARGEST_TURN, and cheaper than `sin_cos`: no range to reduce, short series.
+    Accurate to 2 ulp of 1 for |angle| <= LARGEST_TURN, and cheaper than `sin_cos`: no range reduction, short series.
+
+    Args:
+      sin, cos: sine and cosine of the angle before, any shape.
+      angle: the increase [rad], of the same shape.
     """
     z = angle * angle
     wide = angle.dtype == jnp.float64
@@ -94,7 +104,7 @@ def rotate_by(sin: jax.Array, cos: jax.Array, angle: jax.Array) -> tuple[jax.Arr
 
 
 def _horner(z: jax.Array, coefficients: tuple[float, ...]) -> jax.Array:
-    """c0 + c1 z + c2 z^2 + ..."""
+    """Evaluates c0 + c1 z + c2 z^2 + ..."""
     value = jnp.full_like(z, coefficients[-1])
     for c in reversed(coefficients[:-1]):
         value = value * z + c

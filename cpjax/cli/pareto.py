@@ -161,7 +161,7 @@ def traced(
         {
             "supply": supply,
             "cost": cost,
-            "bland": measure.bland[design][supply, cost].tolist(),
+            "bland": measure.baseline[design][supply, cost].tolist(),
             "reference": measure.reference[supply, cost].tolist(),
             **{
                 kind: {
@@ -198,13 +198,13 @@ def draw(out: Path, plant: CartPole, found: Found, controllers: list[tuple[str, 
         ]
         for cost in COSTS
     }
-    bland: dict[str, dict[str, Any]] = {cost: {} for cost in COSTS}
+    baseline: dict[str, dict[str, Any]] = {cost: {} for cost in COSTS}
     for design in DESIGNS:
         for row in found[design]["rows"]:
             if row["supply"] == own:
-                bland[row["cost"]][design] = np.asarray(row["bland"], float)
+                baseline[row["cost"]][design] = np.asarray(row["bland"], float)
     supplies = {supply: designs for (supply, cost), designs in curves.items() if cost == "effort"}
-    of_all_costs = png(fronts({cost: curves[own, cost] for cost in COSTS}, bland, known))
+    of_all_costs = png(fronts({cost: curves[own, cost] for cost in COSTS}, baseline, known))
     io.write_bytes(out / "supplies.png", png(by_supply(supplies)))
     io.write_bytes(out / "pareto.png", of_all_costs)
 

@@ -113,7 +113,7 @@ def _print(metrics: Metrics) -> None:
     for name, field, unit in _ROWS:
         value = np.asarray(getattr(metrics, field))
         text = str(int(value)) if np.issubdtype(value.dtype, np.integer) else f"{float(value):.4g}"
-        table.add_row(name, "never" if text == "inf" else text, unit)
+        table.add_row(name, "never" if field == "settling_time" and text == "inf" else text, unit)
     table.add_row("flag", describe(int(metrics.flag)), "")
     Console().print(table)
 

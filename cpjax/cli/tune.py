@@ -59,8 +59,8 @@ _PLANNED = {
 OPTIONS = [
     *PLANT_OPTIONS,
     Option("tune", "design", "of the regulator (default lqr)", choices=("lqr", "placement")),
-    Option("tune", "start_from", "bland, paper, or a file with a controller that has a design (default bland)"),
-    Option("tune", "gate", "of bland and paper (default angle-rate)", choices=get_args(GateKind)),
+    Option("tune", "start_from", "baseline, paper, or a file with a controller that has a design (default baseline)"),
+    Option("tune", "gate", "of baseline and paper (default angle-rate)", choices=get_args(GateKind)),
     Option("tune", "frozen", "parameters to leave as they are, with commas between"),
     Option("tune", "free", "the only parameters to change, with commas between"),
     Option("tune", "full_q", "a full state weight (default diagonal)", choices=("full", "diagonal"), flag="q-shape"),
@@ -92,7 +92,7 @@ def run(given: argparse.Namespace) -> int:
     plant = build_plant(sections["plant"])
     setting = dict(sections["tune"])
     chosen: dict[str, Any] = {key: setting.pop(key) for key in ("design", "gate") if key in setting}
-    controller = _begin(setting.pop("start_from", "bland"), plant, chosen)
+    controller = _begin(setting.pop("start_from", "baseline"), plant, chosen)
     notes = notes_on(sections["plant"], plant, {"the controller to start from": controller})
     announce("tune", notes)
     names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}

@@ -1,4 +1,4 @@
-"""What runs in the loop: laws, gates, and the hybrid controller that holds them."""
+"""Controllers: laws, gates (switching regions), and the hybrid controller that combines them."""
 
 from cpjax.controllers.energy import EnergySwingUp
 from cpjax.controllers.feedback import Design, DesignName, LqrWeights, PoleFactors, StateFeedback

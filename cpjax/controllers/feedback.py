@@ -1,4 +1,4 @@
-"""Linear state feedback, and the two designs that it comes from."""
+"""Linear state feedback and its two designs: linear quadratic regulator and pole placement."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, Protocol, TypeAlias, runtime_checkable
@@ -16,42 +16,42 @@ from cpjax.pytree import Array, Scalar, is_traced, matrix, number, part, pytree
 
 
 class Designed(NamedTuple):
-    """What a design makes of a linear model."""
+    """Result of a design for a linear model."""
 
     K: jax.Array
     """Gain (1, 4) of u = -K s."""
     P: jax.Array
-    """(4, 4): s' P s falls along the linear closed loop."""
+    """Shape (4, 4): s' P s falls along the linear closed loop."""
 
 
 DesignName: TypeAlias = Literal["placement", "lqr"]
-"""The ways in which a gain is designed, by name."""
+"""Names of the design methods."""
 
 
 @runtime_checkable
 class Design(Protocol):
-    """What a gain is designed from."""
+    """Interface of a design method, which computes a gain from a linear model."""
 
     def solve(self, A: Array, B: Array) -> Designed:
-        """The gain for this linear model (4, 4), (4, 1). Differentiable."""
+        """Returns gain and P for the linear model A (4, 4), B (4, 1). Differentiable."""
         ...
 
 
 @pytree
 class LqrWeights:
-    """The weights of a linear quadratic regulator."""
+    """Weights of a linear quadratic regulator."""
 
     Q: Array = matrix((4, 4), "per product of states", "state weight, positive semidefinite", symmetric=True)
     R: Scalar = number("1/V^2", "weight of the voltage", above=0.0)
 
     def solve(self, A: Array, B: Array) -> Designed:
-        """By the algebraic Riccati equation; P is its solution."""
+        """Solves the algebraic Riccati equation for A (4, 4), B (4, 1); P is its solution."""
         return Designed(*lqr(A, B, self.Q, jnp.reshape(jnp.asarray(self.R), (1, 1))))
 
 
 @pytree
 class PoleFactors:
-    """The poles of a placement, as factors s^2 + a s + b of the characteristic polynomial; see `QuadraticFactors`."""
+    """Poles of a placement, as factors s^2 + a s + b of the characteristic polynomial; see `QuadraticFactors`."""
 
     a: Array = matrix((2,), "1/s", "above 0: twice the mean rate of decay of each pair")
     b: Array = matrix((2,), "1/s^2", "above 0: product of each pair")
@@ -64,7 +64,7 @@ class PoleFactors:
 
     @classmethod
     def from_poles(cls, poles: Array | Sequence[complex]) -> "PoleFactors":
-        """Of four concrete poles; see `QuadraticFactors.from_poles`.
+        """Builds the factors from four concrete poles [1/s]; see `QuadraticFactors.from_poles`.
 
         Raises:
           InputError: poles that are not four, not stable or not closed under conjugation.
@@ -76,16 +76,16 @@ class PoleFactors:
 
     @property
     def poles(self) -> jax.Array:
-        """The four of them, to read (4,), complex [1/s]."""
+        """Returns the four poles, shape (4,), complex [1/s]; not differentiable where two of them coincide."""
         return self._factors().poles()
 
     @property
     def polynomial(self) -> jax.Array:
-        """The characteristic polynomial (4,), as `place_polynomial` takes it."""
+        """Returns the characteristic polynomial (4,) in the form that `place_polynomial` takes."""
         return self._factors().polynomial()
 
     def solve(self, A: Array, B: Array) -> Designed:
-        """By Ackermann's formula; P solves the closed loop's Lyapunov equation with the right side -I."""
+        """Places the poles by Ackermann's formula; P solves the closed loop's Lyapunov equation with right side -I."""
         K = place_polynomial(A, B, self.polynomial)
         A, B = jnp.asarray(A), jnp.asarray(B)
         return Designed(K, lyapunov(A - B @ K, jnp.eye(4, dtype=K.dtype)))
@@ -97,10 +97,10 @@ class PoleFactors:
 
 @pytree
 class StateFeedback:
-    """u = -K (s - s_ref), with the angle's error taken modulo a turn. A controller on its own, or Hybrid's regulator.
+    """State feedback u = -K (s - s_ref), with the angle error modulo a turn; a controller, or Hybrid's regulator.
 
-    A plain sequence of four gains is accepted for K. `design` only says where K comes from, so that files and tunings
-    know it; the law is K alone.
+    A plain sequence of four gains is accepted for K. `design` only records how K was designed, for files and tuning;
+    the law depends on K alone.
     """
 
     K: Array = matrix((1, 4), "V per unit of state", "gain, u = -K (s - s_ref)")
@@ -113,6 +113,6 @@ class StateFeedback:
             raise InputError("StateFeedback.design", self.design, "LqrWeights, PoleFactors, or None")
 
     def voltage(self, state: State) -> Scalar:
-        """Demanded voltage [V]."""
+        """Returns the demanded voltage [V]."""
         s = deviation(state, self.reference)
         return -(self.K[0, 0] * s[0] + self.K[0, 1] * s[1] + self.K[0, 2] * s[2] + self.K[0, 3] * s[3])

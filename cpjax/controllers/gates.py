@@ -1,9 +1,10 @@
-"""Gates: where the regulator takes over, and where it lets go.
+"""Gates: regions of the state in which the regulator acts.
 
-A gate is a function of the state, its margin: positive inside, zero on the boundary, negative outside, and smooth near
-the boundary. With hysteresis the boundary that ends regulation is wider than the one that begins it: its size (angle
-and rate, or the level of the quadratic form) is (1 + hysteresis) times as large. Angle gates are written in cos(theta),
-so that theta = pi is no boundary; the Lyapunov gate's margin jumps there, but far below zero for any level of use.
+A gate is defined by its margin, a function of the state: positive inside, zero on the boundary, negative outside, and
+smooth near the boundary. With hysteresis the exit region, which ends regulation, is larger than the entry region, which
+begins it: its size (angle and rate, or the level of the quadratic form) is (1 + hysteresis) times as large. Angle gates
+are written in cos(theta), so that theta = pi is no boundary; the Lyapunov gate's margin is discontinuous there, but far
+below zero for any useful level.
 """
 
 import math
@@ -21,56 +22,56 @@ from cpjax.pytree import Array, Scalar, is_traced, matrix, number, part, pytree
 
 
 class Gate(Protocol):
-    """What `Hybrid` asks of a gate."""
+    """Interface of a gate, as `Hybrid` uses it."""
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
-        """Smooth in the state; at least 0 where the regulator acts, given the mode until now."""
+        """Returns the margin, smooth in the state: at least 0 where the regulator acts, given the mode until now."""
         ...
 
 
 @pytree
 class AngleGate:
-    """Open within `half_angle` of upright: margin = cos(theta) - cos(size)."""
+    """Gate within `half_angle` of upright: margin = cos(theta) - cos(size)."""
 
     half_angle: Scalar = number("rad", "angle from upright", above=0.0, at_most=math.pi)
-    hysteresis: Scalar = number("1", "relative widening of the way out", default=0.0, at_least=0.0, typical=0.1)
+    hysteresis: Scalar = number("1", "relative enlargement of the exit region", default=0.0, at_least=0.0, typical=0.1)
 
     def __post_init__(self) -> None:
         _check_widened_angle("AngleGate", self.half_angle, self.hysteresis)
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
-        """Unit 1."""
+        """Returns the margin [1]; its boundary depends on the mode (int32) if there is hysteresis."""
         _, cos = sin_cos(state.theta)
-        # Both edges, then one of them: the edges do not depend on the state, so a batch computes them once.
+        # Both edges, then one of them is selected: they do not depend on the state, so a batch computes them once.
         (_, way_in), (_, way_out) = sin_cos(self.half_angle), sin_cos(self.half_angle * (1.0 + self.hysteresis))
         return cos - jnp.where(mode == REGULATE, way_out, way_in)
 
 
 @pytree
 class AngleRateGate:
-    """Open in a rounded region of angle and rate: (1 - cos theta) / (1 - cos half_angle) + (theta' / rate)^2 <= 1.
+    """Gate with a rounded region of angle and rate: (1 - cos theta) / (1 - cos half_angle) + (theta' / rate)^2 <= 1.
 
-    The region's extent is `half_angle` at rest and `rate` upright.
+    The region extends to `half_angle` at rest and to `rate` upright.
     """
 
     half_angle: Scalar = number("rad", "angle from upright, at rest", above=0.0, at_most=math.pi)
     rate: Scalar = number("rad/s", "angular rate, upright", above=0.0)
-    hysteresis: Scalar = number("1", "relative widening of the way out", default=0.0, at_least=0.0, typical=0.1)
+    hysteresis: Scalar = number("1", "relative enlargement of the exit region", default=0.0, at_least=0.0, typical=0.1)
 
     def __post_init__(self) -> None:
         _check_widened_angle("AngleRateGate", self.half_angle, self.hysteresis)
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
-        """Unit 1."""
+        """Returns the margin [1]; its boundary depends on the mode (int32) if there is hysteresis."""
         _, cos = sin_cos(state.theta)
-        # Both regions, then one of them: they do not depend on the state, so a batch computes them once.
+        # Both regions, then one of them is selected: they do not depend on the state, so a batch computes them once.
         way_in, way_out = self._scales(0.0), self._scales(self.hysteresis)
         per_drop, per_rate = (jnp.where(mode == REGULATE, b, a) for a, b in zip(way_in, way_out, strict=True))
         relative_rate = state.theta_dot * per_rate
         return 1.0 - (1.0 - cos) * per_drop - relative_rate * relative_rate
 
     def _scales(self, widening: Scalar) -> tuple[Scalar, Scalar]:
-        """What 1 - cos(theta) and theta' are multiplied with, for a region (1 + widening) times as large."""
+        """Returns the factors of 1 - cos(theta) and of theta' for a region (1 + widening) times as large."""
         size = 1.0 + widening
         half_edge, _ = sin_cos(0.5 * self.half_angle * size)  # 1 - cos(edge) = 2 sin(edge / 2)^2, without cancellation
         return 0.5 / (half_edge * half_edge), 1.0 / (self.rate * size)
@@ -78,20 +79,20 @@ class AngleRateGate:
 
 @pytree
 class LyapunovGate:
-    """Open in a level set of s' P s, s the deviation from `reference`: margin = 1 - s' P s / level."""
+    """Gate in a level set of s' P s, with s the deviation from `reference`: margin = 1 - s' P s / level."""
 
     P: Array = matrix((4, 4), "per product of states", "symmetric weight, such as LQR's P", symmetric=True)
     level: Scalar = number("1", "s' P s up to which the gate is open", above=0.0)
-    hysteresis: Scalar = number("1", "relative widening of the way out", default=0.0, at_least=0.0, typical=0.1)
+    hysteresis: Scalar = number("1", "relative enlargement of the exit region", default=0.0, at_least=0.0, typical=0.1)
     reference: State = part("the middle of the level set, a State", *NAMES, default=UPRIGHT)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "reference", checked_reference("LyapunovGate.reference", self.reference))
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
-        """Unit 1."""
+        """Returns the margin [1]; its boundary depends on the mode (int32) if there is hysteresis."""
         s = deviation(state, self.reference)
-        # Written out, not as a matrix product: under vmap each component stays an array of its own.
+        # Written as a sum, not as a matrix product, so that under vmap each component stays an array of its own.
         form = sum(self.P[i, j] * s[i] * s[j] for i in range(4) for j in range(4))
         return jnp.where(mode == REGULATE, 1.0 + self.hysteresis, 1.0) - form * (1.0 / self.level)
 

@@ -1,4 +1,4 @@
-"""The hybrid law: a swing-up law outside a gate, a regulator inside it."""
+"""Hybrid controller: a swing-up law outside a gate, a regulator inside it."""
 
 import dataclasses
 
@@ -16,10 +16,10 @@ from cpjax.pytree import Scalar, part, pytree
 
 @pytree
 class Hybrid:
-    """Swing-up law, regulator and the gate between them.
+    """Hybrid controller of a swing-up law, a regulator and the gate that switches between them.
 
-    A rollout that starts between the two boundaries of a gate with hysteresis starts in the swing-up law: without a
-    past, only the way in counts.
+    A rollout whose initial state lies between the entry and exit boundaries of a gate with hysteresis begins in the
+    swing-up law: without an earlier mode, only the entry region counts.
     """
 
     swing_up: Law = part("a law", "voltage")
@@ -27,7 +27,7 @@ class Hybrid:
     gate: Gate = part("a gate", "margin")
 
     def init(self, measurement: State) -> ModeMemory:
-        """Returns the mode at the first measurement: the controller's whole memory."""
+        """Returns the mode at the first measurement, the controller's only memory."""
         return start_memory(self, measurement)
 
     def update(self, memory: ModeMemory, measurement: State) -> tuple[ModeMemory, Scalar]:
@@ -35,15 +35,18 @@ class Hybrid:
         return update_mode(self, memory, measurement)
 
     def start_mode(self, state: State) -> jax.Array:
-        """REGULATE inside the way in, SWING_UP elsewhere."""
+        """Returns REGULATE inside the gate's entry region, SWING_UP elsewhere (int32)."""
         return self.next_mode(state, jnp.asarray(SWING_UP, dtype=jnp.int32))
 
     def next_mode(self, state: State, mode: jax.Array) -> jax.Array:
-        """REGULATE where the gate's margin in the present mode is at least 0. Has no derivative: it is a switch."""
+        """Returns REGULATE where the gate's margin in the present mode is at least 0, else SWING_UP; no derivative."""
         return jnp.where(self._gate_margin(state, mode) >= 0.0, np.int32(REGULATE), np.int32(SWING_UP))
 
     def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
-        """Both laws are evaluated and one is taken; the other, if finite, contributes neither value nor derivative."""
+        """Returns the demanded voltage [V] of the law of `mode`.
+
+        Both laws are evaluated; the one not selected, if finite, contributes neither value nor derivative.
+        """
         regulate, swing_up = (
             real(f"controller.{name}.voltage", call(f"controller.{name}", getattr(self, name), "voltage", state))
             for name in ("regulator", "swing_up")
@@ -51,12 +54,12 @@ class Hybrid:
         return jnp.where(mode == REGULATE, regulate, swing_up)
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
-        """The gate's margin, with the sign that keeps `mode` where it is positive."""
+        """Returns the gate's margin, with the sign that makes it positive while `mode` lasts."""
         margin = self._gate_margin(state, mode)
         return jnp.where(mode == REGULATE, margin, -margin)
 
     def successor(self, mode: jax.Array) -> jax.Array:
-        """The other one."""
+        """Returns the other mode."""
         return (SWING_UP + REGULATE) - mode
 
     def _gate_margin(self, state: State, mode: jax.Array) -> jax.Array:
@@ -64,7 +67,7 @@ class Hybrid:
 
 
 def without_design(controller: Hybrid) -> Hybrid:
-    """The same loop without what its gain was designed from: hybrids of all designs are then one program to compile."""
+    """Returns the controller without its regulator's design, so that hybrids of all designs share one compilation."""
     regulator = controller.regulator
     if isinstance(regulator, StateFeedback):
         regulator = dataclasses.replace(regulator, design=None)

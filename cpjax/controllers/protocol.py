@@ -1,15 +1,15 @@
-"""What a rollout asks of a controller.
+"""Interfaces of controllers in a rollout.
 
-On the sampled clock a `Controller` is what runs in firmware: once per control period it takes a measurement and its
-memory, any pytree, and returns the new memory and a command. A memoryless law, a hybrid with its mode, a PID with its
-integral, an observer with its estimate are all of this kind.
+On the sampled clock a `Controller` corresponds to firmware: once per control period it takes a measurement and its
+memory, any pytree, and returns the new memory and a command. Examples are a memoryless law, a hybrid with its mode, a
+PID with its integral and an observer with its estimate.
 
-The continuous clock, on which a change of mode can be located inside a step, needs to know more: a law for each mode,
-and a smooth function that vanishes where a mode ends (`ModalController`, `SmoothController`). It knows no other memory
-than the mode.
+The continuous clock, on which a change of mode can be located inside a step, requires more: a law for each mode, and a
+smooth function that vanishes where a mode ends (`ModalController`, `SmoothController`). It supports no controller
+memory other than the mode.
 
-A class of any kind will do as long as JAX knows it as a pytree: one made by `cpjax.pytree.pytree`, a dataclass
-registered with JAX, an `equinox.Module`.
+Any class that is a pytree to JAX can be used: one made by `cpjax.pytree.pytree`, a dataclass registered with JAX, an
+`equinox.Module`.
 """
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -49,8 +49,8 @@ class Controller(Protocol):
     def update(self, memory: Any, measurement: Any) -> tuple[Any, Scalar]:
         """Returns the new memory, of the same structure, shapes and dtypes, and the command [V], a scalar.
 
-        What it returns counts once per control period: the drive clips the command and holds it until the next one. (It
-        is evaluated at every step of the integrator, and dropped between control instants.)
+        The result takes effect once per control period: the drive clips the command and holds it until the next one.
+        (`update` is evaluated at every step of the integrator; results between control instants are discarded.)
         """
         ...
 
@@ -60,7 +60,7 @@ class ModalController(Protocol):
     """A law for each mode, and the rule that chooses the mode. Modes are int32 scalars."""
 
     def start_mode(self, state: State) -> jax.Array:
-        """Returns the mode at the start of a rollout, when there is no earlier mode to remember."""
+        """Returns the mode at the start of a rollout, where there is no earlier mode."""
         ...
 
     def next_mode(self, state: State, mode: jax.Array) -> jax.Array:
@@ -74,10 +74,10 @@ class ModalController(Protocol):
 
 @runtime_checkable
 class SmoothController(ModalController, Protocol):
-    """A controller whose mode ends where a smooth function vanishes, so that the moment can be located."""
+    """A controller whose mode ends where a smooth function vanishes, so that the instant can be located."""
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
-        """Returns a number that is at least 0 while `mode` lasts, smooth in the state near 0."""
+        """Returns a scalar that is at least 0 while `mode` lasts, smooth in the state near 0."""
         ...
 
     def successor(self, mode: jax.Array) -> jax.Array:
@@ -90,21 +90,21 @@ class Clocked(Protocol):
     """A part of a controller that depends on the control period, such as a filter, or on time."""
 
     def at_period(self, period: Scalar) -> Any:
-        """Returns what takes its place in a loop of this control period [s].
+        """Returns the part to use instead in a loop with this control period [s].
 
-        A rollout calls this once, before it begins, on every such part of a controller.
+        A rollout calls this once, before its first step, on every such part of a controller.
         """
         ...
 
 
 class ModeMemory(NamedTuple):
-    """The memory of a controller with modes. The loop finds it in any memory, and records the mode.
+    """Memory of a controller with modes. The loop finds it inside any controller's memory and records the mode.
 
     Attributes:
       mode: int32, since the last update.
-      margin: of that mode at the last update; only where the derivative of the mean is asked for, else None.
-      shift: by how much of a control period the last change of mode moves with the parameters: value 0, and the
-        derivative of the moment of crossing; else None.
+      margin: of that mode at the last update; only if the derivative of the mean is requested, else None.
+      shift: of the last change of mode, as a fraction of the control period: value 0, with the derivative of the
+        instant of crossing; only if the derivative of the mean is requested, else None.
     """
 
     mode: jax.Array
@@ -119,7 +119,7 @@ def modes_in(memory: Any) -> list[ModeMemory]:
 
 
 def update_mode(controller: ModalController, memory: ModeMemory, state: State) -> tuple[ModeMemory, Scalar]:
-    """Runs a modal controller for one control period: the next mode, and the voltage that its law demands."""
+    """Runs a modal controller for one control period; returns the next mode and the voltage [V] of its law."""
     mode = integer("controller.next_mode", call("controller", controller, "next_mode", state, memory.mode))
     return ModeMemory(mode), demand(controller, state, mode)
 
@@ -137,7 +137,7 @@ def demand(controller: ModalController, state: State, mode: jax.Array) -> jax.Ar
 
 @pytree
 class SingleLaw:
-    """A `Law` as a controller that never leaves mode 0."""
+    """Adapter of a `Law` to the interface of a controller, always in mode 0."""
 
     law: Law = part("a law", "voltage")
 
@@ -168,7 +168,7 @@ class SingleLaw:
 
 @pytree
 class Sampled:
-    """A `ModalController` of a user's as a `Controller`: its memory is its mode."""
+    """Adapter of a user's `ModalController` to a `Controller`, whose memory is the mode."""
 
     controller: ModalController = part("a controller with modes", "start_mode", "next_mode", "mode_voltage")
 
@@ -180,7 +180,7 @@ class Sampled:
 
 
 def as_controller(controller: Any) -> Any:
-    """Returns `controller` itself, or a bare law as a controller.
+    """Returns `controller` itself, or a bare law wrapped as a controller.
 
     Raises:
       InputError: it is neither a `Controller`, nor a `ModalController`, nor a `Law`.
@@ -200,7 +200,7 @@ def as_controller(controller: Any) -> Any:
 def as_sampled(controller: Any) -> Controller:
     """Returns a law, or a controller of either kind, as a `Controller` with `init` and `update`.
 
-    For controllers that hold another one, such as an observer.
+    For controllers that contain another one, such as an observer.
 
     Raises:
       InputError: as `as_controller` does.
@@ -210,7 +210,7 @@ def as_sampled(controller: Any) -> Controller:
 
 
 def at_period(controller: Any, period: Scalar) -> Any:
-    """Returns the controller with every `Clocked` part told the control period [s], inner parts before outer ones."""
+    """Returns the controller with `at_period(period)` [s] applied to its `Clocked` parts, inner before outer ones."""
 
     def told(node: Any) -> Any:
         if not _is_clocked(node):
@@ -222,7 +222,7 @@ def at_period(controller: Any, period: Scalar) -> Any:
 
 
 def is_clocked(controller: Any) -> bool:
-    """Whether any part of a controller depends on the control period."""
+    """Returns whether any part of a controller depends on the control period."""
     return any(_is_clocked(node) for node in jax.tree.leaves(controller, is_leaf=_is_clocked))
 
 

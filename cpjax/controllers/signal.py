@@ -1,4 +1,4 @@
-"""Commands over time: recorded in an experiment, or planned for one."""
+"""Voltage commands over time, recorded in an experiment or planned for one."""
 
 import dataclasses
 from typing import NamedTuple
@@ -13,22 +13,22 @@ from cpjax.pytree import Array, Scalar, is_traced, matrix, pytree
 
 
 class SignalMemory(NamedTuple):
-    """How far a signal has been played."""
+    """Playback position in a signal."""
 
     samples: jax.Array
-    """Control instants so far, int32: time without the rounding of a sum."""
+    """Number of control instants so far, int32: unlike a sum of periods, free of rounding errors."""
     next: jax.Array
     """Index of the next time of the signal, int32."""
 
 
 @pytree
 class VoltageSignal:
-    """A recorded or planned command, held between its times. A controller that looks at no measurement.
+    """Recorded or planned command, held between its times: an open-loop controller, independent of measurements.
 
-    It is read at the control instants of the sampled clock: at the instant t the command is the voltage of the last
-    time that is not after t, and 0 V before the first. After the last time its voltage stays. A time that is a control
-    instant but for rounding counts as that instant. To replay a log, choose dt or the control period so that the log's
-    times are control instants.
+    It is evaluated at the control instants of the sampled clock: at the instant t the command is the voltage of the
+    last time that is not after t, and 0 V before the first time. The last voltage is held to the end. A time that
+    equals a control instant up to rounding counts as that instant. To replay a log, choose dt or the control period so
+    that the log's times are control instants.
 
     Differentiable in the voltages, not in the times: a command changes at a control instant.
     """
@@ -36,7 +36,7 @@ class VoltageSignal:
     times: Array = matrix((None,), "s", "rising: from when on each voltage is commanded")
     voltages: Array = matrix((None,), "V", "one for each time")
     period: Scalar | None = None
-    """The loop's control period [s], which a rollout fills in."""
+    """Control period of the loop [s], set by the rollout."""
 
     def __post_init__(self) -> None:
         times, voltages = np.shape(self.times), np.shape(self.voltages)
@@ -47,7 +47,7 @@ class VoltageSignal:
             raise InputError("VoltageSignal.times", self.times, "rising")
 
     def at_period(self, period: Scalar) -> "VoltageSignal":
-        """Returns the signal as it is played in a loop of this control period [s]."""
+        """Returns the signal with the control period [s] of its loop."""
         return dataclasses.replace(self, period=period)
 
     def init(self, measurement: object) -> SignalMemory:
@@ -56,7 +56,7 @@ class VoltageSignal:
         return SignalMemory(none, jnp.sum(self._is_due(jnp.asarray(self.times), none)).astype(jnp.int32))
 
     def update(self, memory: SignalMemory, measurement: object) -> tuple[SignalMemory, Scalar]:
-        """Returns the voltage of this instant [V]."""
+        """Returns the new memory and the voltage of this instant [V]."""
         times, voltages = lax.stop_gradient(jnp.asarray(self.times)), jnp.asarray(self.voltages)
         count = times.shape[0]
 
@@ -64,13 +64,13 @@ class VoltageSignal:
             time = lax.dynamic_index_in_dim(times, jnp.minimum(index, count - 1), keepdims=False)
             return (index < count) & self._is_due(time, memory.samples)
 
-        # Of a signal that is finer than the control period, several times are due at once.
+        # If the signal is finer than the control period, several of its times are due at once.
         following = lax.while_loop(is_due, lambda index: index + 1, memory.next)
         voltage = lax.dynamic_index_in_dim(voltages, jnp.maximum(following - 1, 0), keepdims=False)
         return SignalMemory(memory.samples + 1, following), jnp.where(following > 0, voltage, 0.0)
 
     def _is_due(self, time: jax.Array, samples: jax.Array) -> jax.Array:
-        """Whether a time of the signal is not after this control instant, but for rounding."""
+        """Returns whether a time of the signal is not after this control instant, up to rounding."""
         if self.period is None:
             raise InputError("VoltageSignal.period", None, "known: use the signal in a rollout, or at_period(seconds)")
         period = jnp.asarray(self.period, dtype=time.dtype)

@@ -1,7 +1,7 @@
-"""Smooth surrogates of the switch and of the clip, for those who want them. Nothing in the library puts them in.
+"""Optional smooth surrogates of the switch and of the clip; a rollout never inserts them by itself.
 
-They are other controllers, not other views of the same one: their trajectories differ from those of the hard law, the
-less so the lower the temperature, and their derivatives are those of their own trajectories.
+They are different controllers, not another form of the same one: their trajectories differ from those of the hard law,
+by less the lower the temperature, and their derivatives are those of their own trajectories.
 """
 
 import jax
@@ -15,11 +15,11 @@ from cpjax.pytree import Scalar, number, part, pytree
 
 @pytree
 class SmoothHybrid:
-    """Both laws at once, the regulator's share rising from 0 to 1 across the gate's boundary. A law without a mode.
+    """Mixture of both laws, the regulator's weight rising from 0 to 1 across the gate's boundary. A law without modes.
 
         u = w u_regulator + (1 - w) u_swing_up,     w = 1 / (1 + exp(-margin / temperature))
 
-    The margin is that of the way in: a mixture remembers nothing, so a gate's hysteresis has no effect.
+    The margin is that of the entry region: a mixture has no memory, so a gate's hysteresis has no effect.
     """
 
     swing_up: Law = part("a law", "voltage")
@@ -28,7 +28,7 @@ class SmoothHybrid:
     temperature: Scalar = number("1", "margin over which the share rises from 1/2 to 3/4, almost", above=0.0)
 
     def voltage(self, state: State) -> Scalar:
-        """Demanded voltage [V]."""
+        """Returns the demanded voltage [V]."""
         margin = self.gate.margin(state, jnp.asarray(SWING_UP, dtype=jnp.int32))
         share = jax.nn.sigmoid(margin / self.temperature)
         return share * self.regulator.voltage(state) + (1.0 - share) * self.swing_up.voltage(state)
@@ -36,11 +36,11 @@ class SmoothHybrid:
 
 @pytree
 class SmoothClip:
-    """A law whose demand bends towards the supply's limits instead of breaking off at them, and never exceeds them.
+    """Law whose demand approaches the supply's limits smoothly, instead of clipping at them, and never exceeds them.
 
         clip(v) = T log((1 + exp((v + L) / T)) / (1 + exp((v - L) / T))) - L
 
-    with L the limit and T the temperature. Where a motor has the same limit, its own clip is left nothing to do.
+    with L the limit and T the temperature. If the motor has the same limit, its own clip has no effect.
     """
 
     law: Law = part("a law", "voltage")
@@ -48,7 +48,7 @@ class SmoothClip:
     temperature: Scalar = number("V", "over which the demand bends", above=0.0)
 
     def voltage(self, state: State) -> Scalar:
-        """Demanded voltage [V]."""
+        """Returns the demanded voltage [V]."""
         demand, limit, temperature = self.law.voltage(state), self.voltage_limit, self.temperature
         above, below = (demand - limit) / temperature, (demand + limit) / temperature
         return temperature * (jax.nn.softplus(below) - jax.nn.softplus(above)) - limit

@@ -1,1 +1,1 @@
-"""Mathematics that knows no cart-pole."""
+"""Mathematics, independent of the plant."""

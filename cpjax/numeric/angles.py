@@ -10,7 +10,7 @@ from cpjax.pytree import Scalar
 
 
 def wrap_angle(angle: Scalar) -> jax.Array:
-    """`angle` [rad] less the nearest whole number of turns: in [-pi, pi], give or take eps |angle|.
+    """Returns `angle` [rad] minus the nearest whole number of turns, in [-pi, pi] up to about eps |angle|.
 
     The derivative is 1 everywhere.
     """

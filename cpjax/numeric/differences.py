@@ -1,4 +1,4 @@
-"""Derivatives by differences, extrapolated, with an estimate of their error (Ridders, 1982)."""
+"""Derivatives by extrapolated central differences, with an estimate of their error (Ridders, 1982)."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
@@ -9,7 +9,7 @@ Numbers: TypeAlias = np.ndarray[Any, Any]
 
 
 class Differences(NamedTuple):
-    """A derivative, and how far it may be off; both of one shape. NaN and infinite where there is none."""
+    """A derivative and its estimated error, of one shape; NaN and infinite where no difference is valid."""
 
     derivative: Numbers
     uncertainty: Numbers
@@ -20,16 +20,17 @@ def central_differences(
     steps: Numbers,
     valid: Callable[[float], Numbers] | None = None,
 ) -> Differences:
-    """The derivative at 0 of a function of one variable, or of many such functions at once.
+    """Computes the derivative at 0 of a function of one variable, or of many such functions at once.
 
-    Extrapolates the central differences of all consecutive steps to step 0, and returns, of all the extrapolations, the
-    one that changes least with one step more or less: large steps are off by curvature, small ones by rounding. Of many
-    changes some are small by chance, so none counts for less than the rounding of the function's values can do.
+    Extrapolates the central differences of all consecutive steps to step 0, and returns the extrapolation that changes
+    least with one step more or less: large steps have an error by curvature, small ones by rounding. Among many changes
+    some are small by chance, so no change counts as smaller than the rounding error of the function's values.
 
     Args:
       function: takes a step h and returns the function at +h and at -h, arrays of one shape (...).
-      steps: falling by one factor.
-      valid: whether the difference of a step counts, (...); for functions that are smooth only nearby.
+      steps: step sizes, at least two, falling by a constant factor.
+      valid: takes a step and returns whether its difference counts, shape (...); for functions that are smooth only
+        near 0.
     """
     factor = (steps[0] / steps[1]) ** 2
     rows: list[list[Numbers]] = []

@@ -1,11 +1,11 @@
 """Arithmetic with twice the working precision: a number as the unevaluated sum of two floats (Dekker, 1971).
 
-For residuals: what is left when two large, nearly equal things are subtracted has digits in this arithmetic when plain
+It is used for residuals: the difference of two large, nearly equal numbers keeps digits in this arithmetic where plain
 floats have none. The error bounds are those of Joldes, Muller and Popescu (2017): a few units of eps^2, relative to
 the terms that were added, not to a sum in which they cancel.
 
 Compilers may contract a product and a sum into one fused operation, which breaks the usual error-free product. Here
-operands are cut so that the products are exact, and contraction changes nothing.
+operands are split so that the products are exact, and contraction changes nothing.
 """
 
 from typing import NamedTuple
@@ -23,14 +23,14 @@ class DoubleWord(NamedTuple):
 
 
 def double_word(x: jax.Array) -> DoubleWord:
-    """A plain float."""
+    """Converts a plain float array to double-word numbers."""
     return DoubleWord(x, jnp.zeros_like(x))
 
 
 def two_sum(a: jax.Array, b: jax.Array) -> DoubleWord:
-    """a + b, exactly (Knuth).
+    """Computes a + b exactly (Knuth).
 
-    The barrier is for where one of the two is a constant of the program: XLA would take it away again in advance.
+    The barrier is needed where one of the two is a constant of the program: XLA would simplify (a + b) - a to b.
     """
     total = lax.optimization_barrier(a + b)  # type: ignore[no-untyped-call]  # untyped in JAX
     part = total - a
@@ -38,13 +38,13 @@ def two_sum(a: jax.Array, b: jax.Array) -> DoubleWord:
 
 
 def _fast_two_sum(a: jax.Array, b: jax.Array) -> DoubleWord:
-    """a + b, exactly, where |a| is at least |b|; the barrier as in `two_sum`."""
+    """Computes a + b exactly, where |a| is at least |b|; for the barrier see `two_sum`."""
     total = lax.optimization_barrier(a + b)  # type: ignore[no-untyped-call]  # untyped in JAX
     return DoubleWord(total, b - (total - a))
 
 
 def _split(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """x as a sum of two floats with half the digits each, so that products of such halves are exact."""
+    """Splits x into two floats with half the digits each, so that products of such halves are exact."""
     kind, mask = (jnp.uint64, 0xFFFFFFFFF8000000) if x.dtype == jnp.float64 else (jnp.uint32, 0xFFFFF000)
     bits = lax.bitcast_convert_type(x, kind) & jnp.asarray(mask, dtype=kind)
     high = lax.bitcast_convert_type(bits, x.dtype)
@@ -52,7 +52,7 @@ def _split(x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def two_product(a: jax.Array, b: jax.Array) -> DoubleWord:
-    """a b to twice the working precision."""
+    """Computes a b to twice the working precision."""
     a_high, a_low = _split(a)
     b_high, b_low = _split(b)
     cross = two_sum(a_high * b_low, a_low * b_high)
@@ -61,24 +61,24 @@ def two_product(a: jax.Array, b: jax.Array) -> DoubleWord:
 
 
 def add(x: DoubleWord, y: DoubleWord) -> DoubleWord:
-    """x + y."""
+    """Returns x + y."""
     total = two_sum(x.high, y.high)
     return _fast_two_sum(total.high, total.low + (x.low + y.low))
 
 
 def negative(x: DoubleWord) -> DoubleWord:
-    """-x."""
+    """Returns -x."""
     return DoubleWord(-x.high, -x.low)
 
 
 def multiply(x: DoubleWord, y: DoubleWord) -> DoubleWord:
-    """x y."""
+    """Returns x y."""
     total = two_product(x.high, y.high)
     return _fast_two_sum(total.high, total.low + (x.high * y.low + x.low * y.high))
 
 
 def divide(x: DoubleWord, y: DoubleWord) -> DoubleWord:
-    """x / y, by two steps of long division."""
+    """Computes x / y by two steps of long division."""
     first = x.high / y.high
     rest = add(x, negative(multiply(double_word(first), y)))
     second = rest.high / y.high

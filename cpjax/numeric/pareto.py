@@ -1,4 +1,4 @@
-"""Trade-offs between two costs: which points no other beats, and how much they dominate together."""
+"""Pareto fronts of two costs: non-dominated points and the area that they dominate."""
 
 from typing import Any
 
@@ -8,8 +8,13 @@ Numbers = np.ndarray[Any, Any]
 
 
 def nondominated(points: Numbers) -> Numbers:
-    """Indices of the points (n, 2) that no other is at least as good as in both costs and better in one, by rising
-    first cost. Of equal points the first; points with a number that is not finite are never among them.
+    """Returns the indices of the non-dominated points, in ascending order of the first cost.
+
+    A point is dominated if another one is at least as good in both costs and better in one. Of equal points only the
+    first is returned; points with a non-finite number are never returned.
+
+    Args:
+      points: costs, shape (n, 2); smaller is better.
     """
     points = np.asarray(points, float)
     finite = np.flatnonzero(np.all(np.isfinite(points), axis=1))
@@ -20,7 +25,7 @@ def nondominated(points: Numbers) -> Numbers:
 
 
 def hypervolume(points: Numbers, reference: Numbers) -> float:
-    """The area that points (n, 2) dominate up to `reference` (2,): the larger the better (Zitzler and Thiele, 1998)."""
+    """Computes the area that points (n, 2) dominate up to `reference` (2,); larger is better (Zitzler, Thiele, 1998)."""
     points, reference = np.asarray(points, float), np.asarray(reference, float)
     front = points[nondominated(points)]
     front = front[np.all(front < reference, axis=1)]

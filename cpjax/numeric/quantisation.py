@@ -1,4 +1,4 @@
-"""Rounding to the steps of an encoder, a converter or a PWM, with a derivative by name."""
+"""Rounding to the steps of an encoder, a converter or a PWM, with a choice of derivative."""
 
 from typing import Literal, TypeAlias
 
@@ -13,13 +13,14 @@ QuantiserDerivative: TypeAlias = Literal["zero", "straight_through"]
 
 
 def quantize(value: Scalar, step: Scalar, *, derivative: QuantiserDerivative) -> jax.Array:
-    """Returns the multiple of `step` that is nearest to `value`; of two that are as near, the even one.
+    """Returns the multiple of `step` that is nearest to `value`; of two equally near ones, the even one.
 
     Args:
+      value: any shape and unit.
       step: above 0, in the unit of `value`.
-      derivative: in `value`. "zero" is the true one wherever it exists, and tells a tuner nothing. "straight_through"
-        is 1: the derivative of the mean of the result, if where the value lies between two steps is as good as random.
-        (The derivative in `step` is that of the result, `result / step`, for either.)
+      derivative: with respect to `value`. "zero" is exact wherever the derivative exists, and gives a tuner no
+        information. "straight_through" is 1, the derivative of the mean result if the position of the value between two
+        steps can be taken as random. (The derivative with respect to `step` is `result / step` for either.)
 
     Raises:
       InputError: another derivative.

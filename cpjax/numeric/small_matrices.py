@@ -1,11 +1,12 @@
-"""Linear algebra of many small matrices: the matrix axes come first, whatever axes a batch has come last.
+"""Linear algebra of many small matrices: the matrix axes come first, any batch axes come last.
 
-Compilers run along the last axis. With a batch there, every line below is a loop over contiguous numbers that vector
-units like, on a CPU as on a GPU, where a call into LAPACK takes microseconds for each 4 x 4 matrix. Without a batch
-the functions are plain matrix functions. `batch_last` turns a function of such arrays into one that `vmap` may batch.
+Compilers vectorise along the last axis. With a batch there, every line below is a loop over contiguous numbers, which
+suits vector units on a CPU as on a GPU, where a call into LAPACK takes microseconds for each 4 x 4 matrix. Without a
+batch the functions are plain matrix functions. `batch_last` turns a function of such arrays into one that `vmap` may
+batch.
 
-The eliminations and the accurate product are loops of the program, not of the compiler: XLA would fuse the unrolled
-steps and compute each of them anew wherever a later one reads it.
+The eliminations and the accurate product are loops of the program and are not unrolled: XLA would fuse the unrolled
+steps and recompute each of them wherever a later one reads it.
 """
 
 import functools
@@ -24,33 +25,33 @@ Matrix: TypeAlias = jax.Array
 
 
 def transpose(a: Any) -> Any:
-    """The matrix axes exchanged; of plain and of double-word matrices."""
+    """Exchanges the matrix axes of a plain or double-word matrix."""
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), a)
 
 
 def identity_like(a: Matrix) -> Matrix:
-    """The identity of a square matrix's size, dtype and batch."""
+    """Returns the identity with the size, dtype and batch of a square matrix."""
     n = a.shape[0]
     return jnp.broadcast_to(jnp.eye(n, dtype=a.dtype).reshape((n, n) + (1,) * (a.ndim - 2)), a.shape)
 
 
 def symmetric(a: Matrix) -> Matrix:
-    """The symmetric part."""
+    """Returns the symmetric part (a + a') / 2."""
     return 0.5 * (a + transpose(a))
 
 
 def diagonal(a: Matrix) -> jax.Array:
-    """The diagonal, shape (n, ...)."""
+    """Returns the diagonal, shape (n, ...)."""
     return jnp.stack([a[i, i] for i in range(a.shape[0])])
 
 
 def largest(a: Matrix) -> jax.Array:
-    """The largest absolute value among a matrix's elements, shape (...)."""
+    """Returns the largest absolute value among a matrix's elements, shape (...)."""
     return jnp.max(jnp.abs(a), axis=(0, 1))
 
 
 def product(*factors: Matrix) -> Matrix:
-    """The product, from the left to the right."""
+    """Multiplies the factors from left to right."""
 
     def times(a: Matrix, b: Matrix) -> Matrix:
         return functools.reduce(jnp.add, [a[:, i, None] * b[None, i] for i in range(a.shape[1])])
@@ -59,23 +60,23 @@ def product(*factors: Matrix) -> Matrix:
 
 
 def solve(a: Matrix, b: Matrix) -> Matrix:
-    """a^-1 b, by Gauss and Jordan with partial pivoting. A singular `a` gives infinities or NaN."""
+    """Computes a^-1 b by Gauss-Jordan elimination with partial pivoting; a singular `a` gives infinities or NaN."""
     reduced, _ = _eliminate(jnp.concatenate([a, b], axis=1))
     return reduced[:, a.shape[0] :]
 
 
 def inverse(a: Matrix) -> Matrix:
-    """a^-1; see `solve`."""
+    """Computes a^-1; see `solve`."""
     return solve(a, identity_like(a))
 
 
 def log_abs_determinant(a: Matrix) -> jax.Array:
-    """log |det a|, shape (...); -inf for a singular matrix."""
+    """Computes log |det a|, shape (...); -inf for a singular matrix."""
     return _eliminate(a)[1]
 
 
 def is_positive_definite(a: Matrix) -> jax.Array:
-    """Whether a symmetric matrix is positive definite: its pivots, taken in order, are all positive. Shape (...)."""
+    """Returns whether a symmetric matrix is positive definite, shape (...): its pivots, in order, are all positive."""
 
     def step(k: jax.Array, carry: tuple[Matrix, jax.Array]) -> tuple[Matrix, jax.Array]:
         rows, positive = carry
@@ -87,7 +88,7 @@ def is_positive_definite(a: Matrix) -> jax.Array:
 
 
 def _eliminate(rows: Matrix) -> tuple[Matrix, jax.Array]:
-    """The rows (n, n + more) with the first n columns reduced to the identity, and log |det| of those columns."""
+    """Reduces the first n columns of the rows (n, n + k, ...) to the identity; returns log |det| of those columns too."""
     n = rows.shape[0]
     numbers = jnp.arange(n).reshape((n,) + (1,) * (rows.ndim - 1))
 
@@ -104,7 +105,7 @@ def _eliminate(rows: Matrix) -> tuple[Matrix, jax.Array]:
         row, index = lax.fori_loop(k + 1, n, search, (row_k, jnp.full(rows.shape[2:], k)))
         pivot = _row(row, k)
         pivot_row = row / pivot
-        rows = jnp.where(numbers == index, row_k, rows)  # row k goes where the pivot's was
+        rows = jnp.where(numbers == index, row_k, rows)  # row k replaces the pivot row
         rows = jnp.where(numbers == k, pivot_row, rows - _column(rows, k)[:, None] * pivot_row)
         # After a pivot of zero the rows are NaN, but the determinant is known.
         return rows, jnp.where(log_determinant == -jnp.inf, -jnp.inf, log_determinant + jnp.log(jnp.abs(pivot)))
@@ -121,7 +122,7 @@ def _column(a: jax.Array, i: jax.Array) -> jax.Array:
 
 
 def accurate_product(a: DoubleWord, b: DoubleWord) -> DoubleWord:
-    """a b in double-word arithmetic."""
+    """Computes a b in double-word arithmetic."""
 
     def add_term(i: jax.Array, total: DoubleWord) -> DoubleWord:
         column = DoubleWord(*(_column(x, i)[:, None] for x in a))
@@ -133,7 +134,7 @@ def accurate_product(a: DoubleWord, b: DoubleWord) -> DoubleWord:
 
 
 def accurate_solve(a: DoubleWord, b: DoubleWord) -> DoubleWord:
-    """a^-1 b in double-word arithmetic, by Gauss and Jordan with partial pivoting."""
+    """Computes a^-1 b in double-word arithmetic, by Gauss-Jordan elimination with partial pivoting."""
     n = a.high.shape[0]
     rows = DoubleWord(*(jnp.concatenate([x, y], axis=1) for x, y in zip(a, b, strict=True)))
     numbers = jnp.arange(n).reshape((n,) + (1,) * (rows.high.ndim - 1))
@@ -160,7 +161,7 @@ def accurate_solve(a: DoubleWord, b: DoubleWord) -> DoubleWord:
 
 
 def batch_last(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` of arrays with their own axes first, such that `vmap` hands it a batch as the last axis.
+    """Wraps a function of arrays with their own axes first, so that `vmap` passes it a batch as the last axis.
 
     Not differentiable: for use inside a function with a derivative rule of its own.
     """
@@ -185,7 +186,7 @@ def _solve(a: Matrix, b: Matrix) -> Matrix:
 
 
 def linear_solve(a: jax.Array, b: jax.Array) -> jax.Array:
-    """a^-1 b of plain matrices (n, n) and (n, k): differentiable to any order, fast under `vmap`."""
+    """Computes a^-1 b of plain matrices (n, n) and (n, k); differentiable to any order, fast under `vmap`."""
     return lax.custom_linear_solve(
         lambda x: a @ x, b, lambda _, b: _solve(a, b), transpose_solve=lambda _, b: _solve(a.T, b)
     )

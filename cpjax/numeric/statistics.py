@@ -1,18 +1,18 @@
-"""Success rates with their uncertainty."""
+"""Confidence intervals and significance tests of success rates."""
 
 import math
 from statistics import NormalDist
 
 from cpjax.errors import InputError
 
-_MOST = 2**53  # whole numbers up to here are floats without rounding
+_MOST = 2**53  # whole numbers up to here are exact as floats
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Two-sided Wilson score interval of a proportion (Wilson, 1927): `(low, high)` within [0, 1].
+    """Returns the two-sided Wilson score interval `(low, high)` of a proportion, within [0, 1] (Wilson, 1927).
 
     Raises:
-      InputError: `trials` below 1, or `successes` outside 0..trials.
+      InputError: `trials` below 1, `successes` outside 0..trials, or `confidence` outside (0, 1).
     """
     _check_counts(successes, trials)
     if isinstance(confidence, bool) or not isinstance(confidence, (int, float)) or not 0 < confidence < 1:
@@ -29,7 +29,11 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
 
 
 def two_proportion_p_value(successes_a: int, trials_a: int, successes_b: int, trials_b: int) -> float:
-    """p-value of the two-sided, pooled two-proportion z-test; 1.0 where both rates are all or nothing alike."""
+    """Returns the p-value of the two-sided, pooled two-proportion z-test; 1.0 where both rates are 0 or both are 1.
+
+    Raises:
+      InputError: `trials` below 1, or `successes` outside 0..trials, of either.
+    """
     _check_counts(successes_a, trials_a)
     _check_counts(successes_b, trials_b)
     pooled = (successes_a + successes_b) / (trials_a + trials_b)
@@ -41,11 +45,11 @@ def two_proportion_p_value(successes_a: int, trials_a: int, successes_b: int, tr
 
 
 def mcnemar_p_value(only_a: int, only_b: int) -> float:
-    """p-value of McNemar's exact two-sided test: two ways to treat the same subjects (McNemar, 1947).
+    """Returns the p-value of McNemar's exact two-sided test of two treatments of the same subjects (McNemar, 1947).
 
     Args:
-      only_a: how many succeeded under the first alone.
-      only_b: and under the second alone.
+      only_a: number of subjects that succeeded under the first treatment alone.
+      only_b: number of subjects that succeeded under the second treatment alone.
 
     Raises:
       InputError: a count below 0.
@@ -54,7 +58,7 @@ def mcnemar_p_value(only_a: int, only_b: int) -> float:
         if isinstance(count, bool) or not isinstance(count, int) or not 0 <= count <= _MOST:
             raise InputError(name, count, f"a whole number from 0 to {_MOST}")
     total, fewer = only_a + only_b, min(only_a, only_b)
-    # P(at most `fewer` heads in `total` fair tosses), its terms by logarithms: they may be far below 1e-308.
+    # P(at most `fewer` heads in `total` fair tosses), from logarithms of its terms, which may be far below 1e-308.
     logs = [math.lgamma(total + 1) - math.lgamma(k + 1) - math.lgamma(total - k + 1) for k in range(fewer + 1)]
     tail = math.fsum(math.exp(log - total * math.log(2.0)) for log in logs)
     return min(1.0, 2.0 * tail)

@@ -1,4 +1,4 @@
-"""Unconstrained numbers, which an optimiser may move anywhere, and the constrained ones that a design wants."""
+"""Maps between the unconstrained parameters of an optimiser and the constrained ones of a design."""
 
 import jax
 import jax.numpy as jnp
@@ -10,24 +10,24 @@ from cpjax.pytree import is_traced
 
 
 def positive(x: jax.Array) -> jax.Array:
-    """exp(x), element by element: a step in x is a relative change of the positive number, whatever its unit."""
+    """Returns exp(x), element by element: a step in x is a relative change of the positive number, whatever its unit."""
     return jnp.exp(x)
 
 
 def from_positive(y: jax.Array) -> jax.Array:
-    """The x of which `positive` makes y."""
+    """Returns the x that `positive` maps to y."""
     return jnp.log(y)
 
 
 def semidefinite(x: jax.Array) -> jax.Array:
-    """L L' (n, n) with the lower triangle L filled with x (n (n + 1) / 2,), row by row: any symmetric, positive
-    semidefinite matrix, singular ones included.
+    """Returns L L' (n, n), where x (n (n + 1) / 2,) fills the lower triangle L row by row.
 
-    Not one to one: a column of L may change its sign. Along a column of zeros the derivative is zero: an optimiser that
-    starts there stays there.
+    Every symmetric, positive semidefinite matrix has this form, singular ones included. The map is not one to one: a
+    column of L may change its sign. At a column of zeros the derivative is zero: an optimiser that starts there stays
+    there.
 
     Raises:
-      InputError: numbers that fill no triangle.
+      InputError: the length of x is not n (n + 1) / 2 for any n.
     """
     x = jnp.asarray(x)
     n = int(((8 * x.size + 1) ** 0.5 - 1) / 2)
@@ -38,10 +38,10 @@ def semidefinite(x: jax.Array) -> jax.Array:
 
 
 def from_semidefinite(Q: jax.Array) -> jax.Array:
-    """An x of which `semidefinite` makes Q (n, n): the Cholesky factor, with zeros where a pivot vanishes.
+    """Returns an x that `semidefinite` maps to Q (n, n): the Cholesky factor, with zeros where a pivot vanishes.
 
     Raises:
-      InputError: a concrete Q that is not symmetric and positive semidefinite. Under jit x means nothing then.
+      InputError: a concrete Q that is not symmetric and positive semidefinite. Under jit x is then undefined.
     """
     Q = jnp.asarray(Q)
     n = Q.shape[0]
@@ -50,14 +50,14 @@ def from_semidefinite(Q: jax.Array) -> jax.Array:
         room = 16.0 * n * float(np.finfo(Q.dtype).eps) * np.max(np.abs(numbers), initial=0.0)
         if not np.max(np.abs(numbers - numbers.T)) <= room or not np.min(np.linalg.eigvalsh(numbers)) >= -room:
             raise InputError("Q", Q, "symmetric and positive semidefinite")
-    # A pivot that is only rounding would be divided by; relative to its diagonal element it counts as zero.
+    # A pivot at rounding level, relative to its diagonal element, counts as zero: otherwise it would be divided by.
     room = float(np.finfo(Q.dtype).eps) * jnp.diagonal(Q)
     rest, columns = Q, []
     for k in range(n):
         pivot = rest[k, k]
         holds = pivot > room[k]
         column = jnp.where(holds, rest[:, k] / jnp.sqrt(jnp.where(holds, pivot, 1.0)), 0.0)
-        # No element of a semidefinite matrix exceeds the geometric mean of its diagonal ones, but rounding may.
+        # No element of a semidefinite matrix exceeds the geometric mean of its diagonal ones, except by rounding.
         left = lax.stop_gradient(jnp.maximum(jnp.diagonal(rest), 0.0)) ** 0.5
         column = jnp.where(jnp.abs(column) > 1.0001 * left, jnp.sign(column) * left, column)
         column = jnp.where(jnp.arange(n) >= k, column, 0.0)

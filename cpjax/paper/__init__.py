@@ -1,6 +1,6 @@
-"""The student paper that this project starts from: its plants, gains and laws, and what the package says about them.
+"""The student paper that this project starts from: its plants, gains and laws, their reproduction and their audit.
 
-The application of the general packages; none of them imports it.
+An application of the general packages, none of which imports it.
 """
 
 from cpjax.paper.printed import (

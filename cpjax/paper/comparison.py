@@ -1,4 +1,4 @@
-"""Tuned controllers beside the paper's: which of LQR and pole placement is better at 12 V, and at what price?"""
+"""Comparison of tuned controllers with the paper's, by LQR and by pole placement."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +20,7 @@ from cpjax.study.summary import summarise
 
 Report = Callable[[int, int, str], None]
 LAWS = ("as-printed", "corrected")
-"""The paper's two readings, from `cpjax.paper.LAWS`."""
+"""The two readings of the paper's law that are compared, from `cpjax.paper.LAWS`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,29 +28,30 @@ class Entry:
     """A controller in a comparison."""
 
     name: str
-    """Such as "paper, as printed"."""
+    """Name in tables, such as "paper, as printed"."""
     design: paper.Design
     gains: str
-    """printed, computed or tuned."""
+    """Origin of the gains: "printed", "computed" or "tuned"."""
     controller: Hybrid
 
 
 @dataclasses.dataclass(frozen=True)
 class Compared:
-    """An entry, and what it does at every start."""
+    """An entry, and its metrics over n initial states."""
 
     entry: Entry
     metrics: Metrics
-    """Of (n,) arrays."""
+    """Metrics as arrays (n,)."""
     summary: Mapping[str, Any]
-    """See `summarise`."""
+    """Result of `summarise` for these metrics."""
 
 
 def entries(plant: CartPole, tuned: Mapping[paper.Design, Hybrid] | None = None) -> list[Entry]:
-    """The paper's controllers for `plant`, both laws and both gains; and a tuned one of each design.
+    """Returns the paper's controllers for `plant`, of both laws and both gains, and a tuned one of each design.
 
     Args:
-      tuned: instead of the ones that come with the package.
+      plant: the laws' model, for which gains are computed.
+      tuned: tuned controllers by design, in place of the package's presets.
     """
     found = [
         Entry(f"paper, {law.replace('-', ' ')}", design, gains, paper.controller(law, design, plant, gains))
@@ -70,7 +71,18 @@ def compare(
     track_limit: float = float("inf"),
     progress: Report | None = None,
 ) -> tuple[State, list[Compared]]:
-    """Every entry over the same starts, as the protocol's evaluation runs; and the starts."""
+    """Runs every entry from the same initial states, as the protocol's evaluation prescribes.
+
+    Args:
+      plant: the plant.
+      chosen: the entries.
+      setting: initial states, duration and step of the evaluation.
+      track_limit: largest |x| of a successful run [m].
+      progress: called with the entries done, their number, and the next one in words.
+
+    Returns:
+      The initial states, arrays (count,), and the results in the order of the entries.
+    """
     starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
     results = []
     for i, entry in enumerate(chosen):
@@ -92,7 +104,7 @@ def compare(
 
 
 def document(plant: CartPole, results: Sequence[Compared], setting: EvaluationConfig, **others: Any) -> dict[str, Any]:
-    """The comparison for programs."""
+    """Returns the comparison as plain values, for JSON, beside the entries of `others`."""
     rows = [
         {
             "name": one.entry.name,
@@ -113,7 +125,13 @@ def document(plant: CartPole, results: Sequence[Compared], setting: EvaluationCo
 
 
 def best(results: Sequence[Compared], design: paper.Design, *, tuned: bool) -> Compared:
-    """The controller of a design with the most successes, and of those the fastest."""
+    """Returns the result of a design with the most successes, and among equals the least mean settling time.
+
+    Args:
+      results: the comparison.
+      design: "lqr" or "placement".
+      tuned: whether to choose among the tuned controllers or among the paper's.
+    """
     pool = [one for one in results if one.entry.design == design and (one.entry.gains == "tuned") == tuned]
 
     def rank(one: Compared) -> tuple[float, float]:

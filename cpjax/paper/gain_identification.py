@@ -1,7 +1,7 @@
-"""Where printed gains come from: the plant parameters that explain them, and what the gains say about a plant at all.
+"""Identification of plant parameters from printed gains, and of the combinations that the gains determine.
 
-Given gains with the digits they were printed with, and the weights or poles they were designed for, the audit takes a
-plant, lets one parameter change, then each pair of parameters, and so on, and asks whether the gains follow (see
+For gains with the digits they were printed with, and the weights or poles they were designed for, the audit changes one
+parameter of a plant, then each pair of parameters, and so on, and checks whether the computed gains match (see
 `plant_fit`). Residuals are in units of the last printed digit: rounding alone leaves at most 0.5.
 """
 
@@ -24,11 +24,11 @@ from cpjax.pytree import check
 
 @dataclasses.dataclass(frozen=True)
 class Direction:
-    """A combination of parameters, and how well the gains know it.
+    """A combination of parameters, and how well the gains determine it.
 
     Attributes:
       sensitivity: singular value: units of the last digit by which the gains move, for a relative change by 1.
-      weights: the relative change of each parameter, by name; their squares sum to 1. Of one that is zero in the
+      weights: the relative change of each parameter, by name; their squares sum to 1. For one that is zero in the
         plant, the change relative to a size typical of the plant.
     """
 
@@ -37,24 +37,24 @@ class Direction:
 
     @property
     def known_to(self) -> float:
-        """The relative change that moves the gains by half a unit: less than that, nobody can tell."""
+        """Relative change that moves the gains by half a unit of the last digit, the least that is detectable [1]."""
         return 0.5 / self.sensitivity if self.sensitivity > 0.0 else math.inf
 
     @property
     def identified(self) -> bool:
-        """Whether the gains fix the combination at all, to better than 10 %."""
+        """Whether the gains determine the combination to better than 10 %."""
         return self.known_to < 0.1
 
 
 @dataclasses.dataclass(frozen=True)
 class GainAudit:
-    """What `audit_gains` found.
+    """Result of `audit_gains`.
 
     Attributes:
-      unchanged: residuals with the plant as it is, in units of the last digit.
-      fits: for each set of parameters that may change, smallest sets first.
-      directions: combinations of all parameters at the best fit of the smallest sets that explain the gains (or of the
-        best fit, if none does), best known first.
+      unchanged: residuals with the unchanged plant, in units of the last digit, all gains in a row.
+      fits: best fit for each set of parameters that may change, smallest sets first.
+      directions: combinations of all parameters, best determined first, at the best fit of the smallest sets that
+        explain the gains (or at the best fit, if none does).
       plant: the plant of that fit.
     """
 
@@ -64,12 +64,12 @@ class GainAudit:
     plant: CartPole
 
     def best(self, size: int) -> Fit:
-        """The best fit among the sets of `size` parameters."""
+        """Returns the best fit among the sets of `size` parameters."""
         return min((fit for fit in self.fits if len(fit.parameters) == size), key=lambda fit: fit.worst)
 
     @property
     def simplest(self) -> tuple[Fit, ...]:
-        """The fits that explain the gains with the fewest changes, best first; empty if none does."""
+        """Fits that explain the gains with the fewest parameters changed, best first; empty if none does."""
         explaining = [fit for fit in self.fits if fit.explains]
         fewest = min((len(fit.parameters) for fit in explaining), default=0)
         return tuple(sorted((f for f in explaining if len(f.parameters) == fewest), key=lambda fit: fit.worst))
@@ -85,19 +85,21 @@ def audit_gains(
     seed: int = 1,
     progress: Progress | None = None,
 ) -> GainAudit:
-    """Which changes of `plant` explain the gains, and which combinations of parameters the gains know.
+    """Finds changes of `plant` that explain the gains, and the combinations of parameters that the gains determine.
 
     Args:
+      prints: the gains.
+      plant: the plant to change.
       parameters: those that may change, by name (of `PARAMETERS`).
-      most: how many may change at once; every set of up to so many is tried.
-      starts: random starts for each set, each parameter within a factor of 3 of the plant's value. A parameter that is
-        zero in the plant starts within that factor of a size typical of the plant.
-      seed: of the starts.
-      progress: called with how much is done, of how much, and what comes next.
+      most: number of parameters that may change at once; every set of up to so many is tried.
+      starts: random initial points of the fit of each set, each parameter within a factor of 3 of the plant's value, or
+        of a size typical of the plant if that is zero.
+      seed: of the initial points.
+      progress: called with the sets done, their number, and the current work in words.
 
     Raises:
-      InputError: no gain, one of a design that `plant` has no gain for, an unknown parameter, a count below 1 or a
-        negative seed.
+      InputError: no gain, a gain of a design that cannot be computed for `plant`, an unknown or repeated parameter, a
+        count out of range or a negative seed.
     """
     if not isinstance(plant, CartPole):
         raise InputError("plant", plant, "a cpjax.CartPole")
@@ -129,7 +131,7 @@ def audit_gains(
 
 
 def document(audit: GainAudit, prints: Sequence[PrintedGain], plant: CartPole, **setting: Any) -> dict[str, Any]:
-    """The audit as plain values, for JSON."""
+    """Returns the audit as plain values, for JSON, beside the entries of `setting`."""
 
     def row(fit: Fit) -> dict[str, Any]:
         return {**dataclasses.asdict(fit), "worst": fit.worst, "explains": fit.explains}
@@ -162,7 +164,7 @@ def _plain(value: Any) -> Any:
 
 
 def _directions(prints: tuple[PrintedGain, ...], plant: CartPole, names: tuple[str, ...]) -> tuple[Direction, ...]:
-    """Singular values and vectors of the gains' dependence on relative changes of all parameters, at `plant`."""
+    """Returns singular values and vectors of the gains' derivative by relative changes of parameters, at `plant`."""
     _, J = linearised(prints, plant)
     relative = J[:, [PARAMETERS.index(name) for name in names]] * [scale_of(plant, name) for name in names]
     _, values, vectors = np.linalg.svd(relative, full_matrices=True)

@@ -1,7 +1,7 @@
-"""Plants fitted to printed gains: least squares over chosen parameters, from many random starts at once.
+"""Fits of plants to printed gains: least squares over chosen parameters, from many random initial points at once.
 
-Gauss and Newton's method, damped by Levenberg and Marquardt, on derivatives through `linearize`, `lqr` and
-`place_polynomial`. Residuals are in units of the last printed digit.
+The Levenberg-Marquardt method, on derivatives through `linearize`, `lqr` and `place_polynomial`. Residuals are in units
+of the last printed digit.
 """
 
 import dataclasses
@@ -20,27 +20,27 @@ from cpjax.plant import CartPole, Motor, parameter, parameters_of, with_paramete
 from cpjax.pytree import cast, numbers
 
 PARAMETERS = tuple(name for name, rule in numbers(CartPole, Motor).items() if rule.linear and rule.scales)
-"""Every number of a plant that its linear model may depend on, but for those that not every positive factor leaves in
-their range: a fit multiplies by any."""
+"""Names of the parameters of a plant that its linear model may depend on and whose range holds every positive number: a
+fit multiplies them by any positive factor."""
 
 EXPLAINED = 1.0
-"""Worst residual, in units of the last digit, up to which gains count as explained: rounding twice is 1.0."""
+"""Worst residual, in units of the last digit, up to which gains count as explained: two roundings leave up to 1.0."""
 
 _STEPS = 40
-_LANES = 512  # fits that run side by side
+_LANES = 512  # batch size: fits that run at once
 _START_FACTOR = 3.0
 Progress: TypeAlias = Callable[[int, int, str], None]
 
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """The best that changing some of a plant's parameters does for the gains.
+    """Best fit of the gains by changes of some of a plant's parameters.
 
     Attributes:
-      parameters: which may change.
-      values: what they become.
-      residuals: computed less printed gain, in units of the last digit, all gains in a row.
-      reached: share of the random starts that end there (in cost, within 1 % or 0.01 of the best).
+      parameters: names of those that may change.
+      values: their fitted values [SI].
+      residuals: computed minus printed gain, in units of the last digit, all gains in a row.
+      reached: share of the random initial points whose fit ends at a cost within 1 % or 0.01 of the best.
     """
 
     parameters: tuple[str, ...]
@@ -50,17 +50,17 @@ class Fit:
 
     @property
     def worst(self) -> float:
-        """The largest residual, in units of the last digit."""
+        """Largest magnitude of a residual, in units of the last digit."""
         return max(abs(r) for r in self.residuals)
 
     @property
     def explains(self) -> bool:
-        """Whether every gain follows."""
+        """Whether every residual is at most `EXPLAINED`."""
         return self.worst <= EXPLAINED
 
 
 def scale_of(plant: CartPole, name: str) -> float:
-    """The parameter's value; where it is zero, its typical size on this plant."""
+    """Returns the parameter's value [SI]; if it is zero, its typical size on this plant."""
     return float(parameter(plant, name)) or parameters_of(plant)[name].size(plant) or 1.0
 
 
@@ -73,7 +73,7 @@ def _residuals(prints: Sequence[PrintedGain], plant: CartPole) -> jax.Array:
 def _with_derivatives(
     prints: tuple[PrintedGain, ...], plant: CartPole, values: Callable[[jax.Array], Mapping[str, Any]], x: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Residuals (4 gains), and their derivatives (4 gains, n) by x (n,), on the plant changed to `values(x)`."""
+    """Returns residuals (4 gains,) and derivatives (4 gains, n) by x (n,), on the plant changed to `values(x)`."""
 
     def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         r = _residuals(prints, with_parameters(plant, values(x)))
@@ -83,11 +83,11 @@ def _with_derivatives(
     return r, J
 
 
-# Compiled for all parameters, whichever are asked for: one program serves every audit of as many gains.
+# Compiled for all parameters, whichever may change: one program serves every audit of the same number of gains.
 
 
 def linearised(prints: tuple[PrintedGain, ...], plant: CartPole) -> tuple[Any, Any]:
-    """Residuals on `plant`, and their derivatives by all `PARAMETERS`, as NumPy arrays."""
+    """Returns the residuals (4 gains,) on `plant` and their derivatives by all `PARAMETERS`, as NumPy arrays."""
     r, J = _compiled_linearisation(prints, *_numbers(plant))
     return np.asarray(r), np.asarray(J)
 
@@ -100,13 +100,20 @@ def _compiled_linearisation(
 
 
 def _numbers(plant: CartPole) -> tuple[CartPole, jax.Array]:
-    """The plant with arrays for numbers, and the values of all `PARAMETERS`, of one dtype."""
+    """Returns the plant with arrays for numbers, and the values of all `PARAMETERS`, of one dtype."""
     numbers = jnp.asarray([float(parameter(plant, name)) for name in PARAMETERS])
     return cast(plant, numbers.dtype), numbers
 
 
 def random_starts(sets: Sequence[tuple[str, ...]], most: int, count: int, seed: int) -> np.ndarray[Any, Any]:
-    """Logarithms of factors (sets, count, most); those beyond a set's size are not used."""
+    """Draws logarithms of factors (sets, count, most), from 1/3 to 3; those beyond a set's size are unused.
+
+    Args:
+      sets: names of the parameters of each fit.
+      most: size of the largest set.
+      count: initial points of each set.
+      seed: of the random numbers.
+    """
     generator, spread = np.random.default_rng(seed), math.log(_START_FACTOR)
     return generator.uniform(-spread, spread, (len(sets), count, most))
 
@@ -118,9 +125,17 @@ def fit_all(
     starts: np.ndarray[Any, Any],
     progress: Progress | None,
 ) -> list[Fit]:
-    """The best of all starts (sets, count, most) for each set of parameters."""
+    """Fits each set of parameters from all its initial points, and returns the best fit of each.
+
+    Args:
+      prints: the gains.
+      plant: the plant, which keeps the parameters that are not in a set.
+      sets: names of the parameters of each fit, all in `PARAMETERS`.
+      starts: logarithms of factors (sets, count, most), see `random_starts`.
+      progress: called with the sets done, their number, and the current work in words.
+    """
     count, most = starts.shape[1:]
-    # Sets of any size in one program: an index beyond the last parameter stands for one less.
+    # One program for sets of any size: an index beyond the last parameter is padding of a smaller set.
     padded = [[*map(PARAMETERS.index, names), *[len(PARAMETERS)] * (most - len(names))] for names in sets]
     chosen, x = np.repeat(padded, count, axis=0), starts.reshape(-1, most)
     base = jnp.asarray([scale_of(plant, name) for name in PARAMETERS])
@@ -130,7 +145,7 @@ def fit_all(
         if progress is not None:
             text = f"sets of up to {most} parameters, {count} starts each"
             progress(first // count, len(sets), text)
-        now = np.arange(first, first + lanes) % len(x)  # what the last round has too much is dropped below
+        now = np.arange(first, first + lanes) % len(x)  # surplus elements of the last batch are dropped below
         ends.append(_fitted(prints, *_numbers(plant), base, chosen[now], jnp.asarray(x[now])))
     found, rest = (np.concatenate(a)[: len(x)].reshape(len(sets), count, -1) for a in zip(*ends, strict=True))
     cost = np.sum(rest**2, axis=-1)
@@ -159,13 +174,13 @@ def _fitted(
     chosen: jax.Array,
     starts: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """The chosen parameters (lanes, most) and the residuals (lanes, 4 gains) where each start ends.
+    """Returns the fitted values (n, most) of the chosen parameters and the residuals (n, 4 gains) of n fits.
 
     Args:
-      own: (parameters,) values of those that are not chosen.
-      base: (parameters,) what the exponentials of `starts` are factors of.
-      chosen: (lanes, most) indices into `PARAMETERS`, or their number for none.
-      starts: (lanes, most).
+      own: values of all parameters on the plant, used for those not chosen (parameters,).
+      base: values that the exponentials of `starts` multiply (parameters,).
+      chosen: indices into `PARAMETERS`, or their number for none (n, most).
+      starts: initial points, logarithms of factors (n, most).
     """
     own, base = jnp.append(own, 1.0), jnp.append(base, 1.0)
 
@@ -183,13 +198,15 @@ def _fitted(
 def least_squares(
     residuals: Callable[[jax.Array], tuple[jax.Array, jax.Array]], x: jax.Array, count: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Minimises the residuals' sum of squares by Levenberg and Marquardt's method, from x (n,).
+    """Minimises the residuals' sum of squares by the Levenberg-Marquardt method.
 
     Args:
-      residuals: gives residuals (count,) and their derivatives (count, n).
+      residuals: maps x (n,) to residuals (count,) and their derivatives (count, n).
+      x: initial point (n,).
+      count: number of residuals.
 
     Returns:
-      Where it ends (n,), and the residuals there (count,); these are infinite if they are not finite at the start.
+      The best point found (n,), and the residuals there (count,), which are infinite if they are not finite at `x`.
     """
 
     def step(carry: tuple[Any, ...], _: None) -> tuple[Any, None]:
@@ -203,7 +220,7 @@ def least_squares(
         H = J.T @ J
         scale = jnp.diagonal(H)
         damped = H + damping * jnp.diag(jnp.where(scale > 0.0, scale, 1.0))
-        # A relative change by more than e in one step leaves the region where a derivative means something.
+        # A change by more than a factor of e in one step would leave the region where the linearisation holds.
         return (x - jnp.clip(linear_solve(damped, (J.T @ r)[:, None])[:, 0], -1.0, 1.0), best, damping), None
 
     unknown = jnp.full((count,), jnp.inf, dtype=x.dtype)

@@ -1,7 +1,7 @@
 """The paper that this project starts from: its plants, gains and laws, as printed and as corrected.
 
 "Swing-up Control of an Inverted Pendulum Comparing LQR and Pole Placement", a student paper with a MATLAB simulation.
-Its sections are cited below; docs/paper.md lists its errors in print with the test that shows each.
+Its sections are cited below; docs/paper.md lists its errors with the test that shows each.
 """
 
 import math
@@ -41,20 +41,21 @@ PRINTED_GAINS: Mapping[Design, tuple[float, float, float, float]] = {
     "placement": (-24.74, -25.36, 111.70, 28.58),  # section IV-A
     "lqr": (-1414.21, -1180.17, 4795.02, 966.35),  # section IV-B
 }
-"""u = -K s with these K. They do not follow from the appendix; see `identified_plant`."""
+"""Gains K of u = -K s, V per SI unit of state. They do not follow from the appendix; see `identified_plant`."""
 
 SWITCH_ANGLE = math.radians(30.0)
 """Angle from upright at which the linear law takes over, section IV-C [rad]."""
 
 ENERGY_GAIN = 0.2
-"""k of the energy law, section IV-C."""
+"""Gain k of the energy law, section IV-C."""
 
 
 def appendix_plant() -> CartPole:
-    """The plant with the appendix's parameters, in SI units.
+    """Returns the plant with the appendix's parameters, in SI units.
 
-    The paper's wheel has r = 1 m and its gear n = 1 without saying so; its pole has no inertia and nothing rubs
-    (section III-A). "Nmm" for the bearing friction is read as N m s/rad and "rad/(sV)" for k_V as V s/rad.
+    The paper implies a wheel of r = 1 m and a gear of n = 1; its pole has no inertia about its centre of mass, and cart
+    and pivot have no friction (section III-A). "Nmm" for the bearing friction is read as N m s/rad and "rad/(sV)" for
+    k_V as V s/rad.
     """
     motor = Motor(
         torque_constant=1.25,
@@ -68,11 +69,11 @@ def appendix_plant() -> CartPole:
 
 
 def identified_plant() -> CartPole:
-    """The plant from which all eight printed gains do follow, to within half a unit of their last printed digit.
+    """Returns the plant that yields all eight printed gains, to within half a unit of their last printed digit.
 
     It differs from the appendix in two numbers, the force per volt k_T / (R r) = 1.03846 N/V and the total damping
-    d = 1.93007 N s/m; the print fixes them to about 1e-4 N/V and 5e-3 N s/m, the further digits are a choice. R is
-    kept, so k_T follows from the first and k_V from the second; the gains say nothing about R.
+    d = 1.93007 N s/m; the print determines them to about 1e-4 N/V and 5e-3 N s/m, the further digits are a choice. R is
+    the appendix's, so k_T follows from the first and k_V from the second; the gains do not depend on R otherwise.
     """
     force_per_voltage, damping = 1.03846, 1.93007
     resistance, viscous_friction = 1.25, 1e-5
@@ -97,15 +98,15 @@ class PrintedSwingUp:
 
         u = k dE theta' cos(theta),    dE = 2/3 m l^2 theta'^2 - m g l (cos(theta) - 1)
 
-    dE is never negative, so the law pumps without end; both of its signs are wrong, which cancels. Hanging at rest it
-    asks for nothing: as printed, it never starts.
+    dE is never negative, so the law never stops pumping; both of its signs are wrong, which cancels. Hanging at rest it
+    demands 0 V, so it never leaves that equilibrium.
     """
 
-    model: CartPole = part("the law's own idea of the plant, a CartPole", "pole_mass", "pole_length", "gravity")
+    model: CartPole = part("plant model used by the law, a CartPole", "pole_mass", "pole_length", "gravity")
     energy_gain: Scalar = number("V/(J rad/s)", "k of the law as printed", default=ENERGY_GAIN)
 
     def voltage(self, state: State) -> Scalar:
-        """Demanded voltage [V]."""
+        """Returns the demanded voltage [V]."""
         _, cos = sin_cos(state.theta)
         m, l, g = self.model.pole_mass, self.model.pole_length, self.model.gravity
         energy_error = 2.0 / 3.0 * m * l * l * state.theta_dot * state.theta_dot - m * g * l * (cos - 1.0)
@@ -119,15 +120,15 @@ class CorrectedSwingUpAsVoltage:
 
         u = -k E theta' cos(theta),    E = 1/2 m l^2 theta'^2 + m g l (cos(theta) - 1)
 
-    Correct as a law for the pivot's acceleration; the paper's simulation feeds it to the motor. A volt is not a metre
-    per second squared, and the cart's own dynamics come between: it never gets there.
+    Correct as a law for the pivot's acceleration; the paper's simulation applies it to the motor as a voltage. The
+    cart's dynamics lie between voltage and acceleration, so the law does not swing the pendulum up.
     """
 
-    model: CartPole = part("the law's own idea of the plant, a CartPole", "pendulum_energy")
+    model: CartPole = part("plant model used by the law, a CartPole", "pendulum_energy")
     energy_gain: Scalar = number("V/(J rad/s)", "k of the law", default=ENERGY_GAIN)
 
     def voltage(self, state: State) -> Scalar:
-        """Demanded voltage [V]."""
+        """Returns the demanded voltage [V]."""
         _, cos = sin_cos(state.theta)
         return -self.energy_gain * self.model.pendulum_energy(state) * state.theta_dot * cos
 
@@ -143,7 +144,7 @@ longer the paper's: the corrected law with a larger gain and with cart-centring 
 
 
 def computed_gain(design: Design, plant: CartPole) -> jax.Array:
-    """The gain (1, 4) that the paper's poles or weights really give on `plant`; differentiable in its parameters.
+    """Returns the gain (1, 4) that the paper's poles or weights give on `plant`; differentiable in its parameters.
 
     Raises:
       InputError: `design` is not one of the two, or the plant has no such gain.
@@ -157,12 +158,12 @@ def computed_gain(design: Design, plant: CartPole) -> jax.Array:
 
 
 def _state_weight() -> list[list[float]]:
-    """Q as a matrix; a list takes the dtype of the plant's model."""
+    """Returns Q (4, 4) as a list, which takes the dtype of the plant's model."""
     return np.diag(Q).tolist()
 
 
 def riccati_solution(plant: CartPole) -> jax.Array:
-    """P (4, 4) of the paper's linear quadratic regulator on `plant` (section IV-B, "State Dependent" there).
+    """Returns P (4, 4) of the paper's linear quadratic regulator on `plant` (section IV-B, "State Dependent" there).
 
     Raises:
       InputError: the plant has no such regulator.
@@ -175,10 +176,15 @@ def riccati_solution(plant: CartPole) -> jax.Array:
 
 
 def regulator(design: Design, gains: Gains, plant: CartPole) -> StateFeedback:
-    """The linear law of section IV with its gain as printed, or as computed from the printed poles or weights.
+    """Returns the linear law of section IV with its gain as printed, or computed from the printed poles or weights.
+
+    Args:
+      design: "lqr" or "placement".
+      gains: "printed" or "computed".
+      plant: the plant that a computed gain is for.
 
     Raises:
-      InputError: `design` or `gains` is not one of its two words.
+      InputError: an unknown `design` or `gains`, or a plant for which the gain cannot be computed.
     """
     _check_choice("design", design, get_args(Design))
     _check_choice("gains", gains, get_args(Gains))
@@ -188,19 +194,26 @@ def regulator(design: Design, gains: Gains, plant: CartPole) -> StateFeedback:
 
 
 def design_inputs(design: Design) -> LqrWeights | PoleFactors:
-    """What section IV designs the gain from: its weights, or its poles."""
+    """Returns the weights or the poles from which section IV designs the gain.
+
+    Raises:
+      InputError: an unknown design.
+    """
     _check_choice("design", design, get_args(Design))
     return LqrWeights(np.diag(Q), R) if design == "lqr" else PoleFactors.from_poles(POLES)
 
 
 def controller(law: str, design: Design, plant: CartPole, gains: Gains = "printed") -> Hybrid:
-    """The paper's hybrid controller: a law of `LAWS`, the regulator of `design`, and the switch at 30 degrees.
+    """Returns the paper's hybrid controller: a law of `LAWS`, the regulator of `design`, and the switch at 30 degrees.
 
     Args:
-      plant: the law's model, and what `gains="computed"` are computed for.
+      law: a key of `LAWS`.
+      design: "lqr" or "placement".
+      plant: the law's model, and the plant that a computed gain is for.
+      gains: "printed" or "computed".
 
     Raises:
-      InputError: an unknown name.
+      InputError: an unknown name, or a plant for which the gain cannot be computed.
     """
     _check_choice("law", law, LAWS)
     return Hybrid(LAWS[law](plant), regulator(design, gains, plant), AngleGate(SWITCH_ANGLE))

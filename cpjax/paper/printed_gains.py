@@ -1,4 +1,4 @@
-"""Gains as somebody printed them: with digits that say how precise they are, and with what they were designed for."""
+"""Printed gains with the precision of their digits, and the weights or poles that they were designed for."""
 
 import dataclasses
 import math
@@ -20,13 +20,13 @@ _NUMBER = re.compile(r"[-+]?(?=\.?\d)\d*(\.(?P<decimals>\d*))?([eE](?P<exponent>
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PrintedGain:
-    """A gain as printed, and what it was designed for: weights or poles.
+    """A gain as printed, and the weights or poles that it was designed for.
 
     Attributes:
-      gain: four numbers, K of u = -K s.
-      unit: the size of the last printed digit of each.
-      poles: what it places, or None.
-      Q: diagonal of the state weight, or None.
+      gain: K of u = -K s (4,).
+      unit: size of the last printed digit of each (4,).
+      poles: four closed-loop poles [1/s], or None.
+      Q: diagonal of the state weight (4,), or None.
       R: weight of the voltage, or None.
     """
 
@@ -38,7 +38,15 @@ class PrintedGain:
 
     @classmethod
     def placement(cls, texts: Sequence[str], poles: Sequence[complex]) -> "PrintedGain":
-        """A gain of pole placement, from its numbers as printed: the digits say how precise they are."""
+        """Returns a gain of pole placement, from its numbers as printed, whose digits give their precision.
+
+        Args:
+          texts: four numbers as printed, such as "-24.70".
+          poles: four closed-loop poles, closed under conjugation [1/s].
+
+        Raises:
+          InputError: texts that are not four numbers, or poles that are not four or not closed under conjugation.
+        """
         gain, unit = _parsed("placement gain", texts)
         if polynomial_from_poles(poles).shape != (4,):
             raise InputError("poles", poles, "four of them")
@@ -46,7 +54,17 @@ class PrintedGain:
 
     @classmethod
     def lqr(cls, texts: Sequence[str], Q: Sequence[float], R: float) -> "PrintedGain":
-        """A gain of a linear quadratic regulator with Q = diag(...), from its numbers as printed."""
+        """Returns a gain of a linear quadratic regulator with a diagonal Q, from its numbers as printed.
+
+        Args:
+          texts: four numbers as printed, such as "-24.70".
+          Q: diagonal of the state weight (4,).
+          R: weight of the voltage.
+
+        Raises:
+          InputError: texts that are not four numbers, a Q that is not four finite numbers at least 0, or an R that is
+            not finite and above 0.
+        """
         gain, unit = _parsed("lqr gain", texts)
         try:
             diagonal, weight = tuple(float(q) for q in Q), float(R)
@@ -60,11 +78,11 @@ class PrintedGain:
 
     @property
     def design(self) -> str:
-        """Which of the two."""
+        """Design that the gain is from: "placement" or "lqr"."""
         return "placement" if self.poles is not None else "lqr"
 
     def computed(self, plant: CartPole) -> jax.Array:
-        """The gain (4,) that the poles or weights give on `plant`."""
+        """Returns the gain (4,) that the poles or weights give on `plant`."""
         A, B = linearize(plant)
         if self.poles is not None:
             return place_polynomial(A, B, polynomial_from_poles(self.poles).astype(A.dtype))[0]
@@ -73,7 +91,7 @@ class PrintedGain:
 
 
 def printed_in_the_paper() -> list[PrintedGain]:
-    """The paper's two gains, with two decimals each (sections IV-A and IV-B)."""
+    """Returns the paper's two gains, with two decimals each (sections IV-A and IV-B)."""
 
     def texts(design: paper.Design) -> list[str]:
         return [f"{k:.2f}" for k in paper.PRINTED_GAINS[design]]
@@ -82,7 +100,7 @@ def printed_in_the_paper() -> list[PrintedGain]:
 
 
 def _parsed(field: str, texts: Sequence[str]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Numbers as printed, and the sizes of their last digits."""
+    """Returns the numbers as printed, and the sizes of their last digits."""
     if isinstance(texts, str) or len(texts) != 4:
         raise InputError(field, texts, "four numbers as printed")
     values, units = [], []

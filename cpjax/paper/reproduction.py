@@ -1,4 +1,4 @@
-"""The paper's controllers, run fairly: every law on every plant with every gain, over one seeded set of starts."""
+"""Reproduction of the paper: every law on every plant with every gain, over one seeded set of initial states."""
 
 import dataclasses
 import itertools
@@ -26,7 +26,7 @@ GAINS: tuple[paper.Gains, ...] = ("printed", "computed")
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """One controller on one plant."""
+    """One of the paper's controllers on one of its plants."""
 
     law: str
     plant: str
@@ -36,7 +36,14 @@ class Variant:
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationConfig:
-    """How the protocol's evaluation runs are made: RK4, the sampled clock with one control instant a step.
+    """Configuration of the protocol's evaluation: RK4, and the sampled clock with one control instant per step.
+
+    Attributes:
+      starts: name of the set of initial states.
+      count: number of initial states.
+      seed: of the initial states.
+      duration: of the runs [s].
+      dt: step and control period [s].
 
     Raises:
       InputError: a value outside its range.
@@ -54,12 +61,12 @@ class EvaluationConfig:
 
 
 def variants() -> list[Variant]:
-    """All of them, in the order of the tables."""
+    """Returns all variants, in the order of the tables."""
     return [Variant(*choice) for choice in itertools.product(paper.LAWS, paper.PLANTS, DESIGNS, GAINS)]
 
 
 def evaluate(variant: Variant, setting: EvaluationConfig, starts: State | None = None) -> Metrics:
-    """Metrics of one variant over the setting's starts."""
+    """Returns the metrics (n,) of one variant from the initial states `starts` (n,), by default the setting's."""
     plant = paper.PLANTS[variant.plant]()
     controller = without_design(paper.controller(variant.law, variant.design, plant, variant.gains))
     if starts is None:
@@ -73,12 +80,14 @@ def evaluate(variant: Variant, setting: EvaluationConfig, starts: State | None =
 def reproduce(
     setting: EvaluationConfig, *, progress: Callable[[int, int, str], None] | None = None, path: Path | None = None
 ) -> list[dict[str, Any]]:
-    """One row per variant: the variant's names beside what `summarise` says of its metrics.
+    """Returns one row per variant: its names, and the result of `summarise` for its metrics.
 
     Args:
+      setting: configuration of the evaluation.
       progress: called with the rows done, their number, and the next row in words.
-      path: where to save the rows after each of them (JSON). Rows of an interrupted run with the same setting and
-        versions, found there, are not computed again; after changing the code, choose another path.
+      path: JSON file in which the rows are saved after each of them; a file of anything else is overwritten. Rows of an
+        interrupted run with the same setting and versions are not computed again; after changing the code, choose
+        another path.
 
     Raises:
       InputError: a `path` that cannot be written.
@@ -98,10 +107,16 @@ def reproduce(
 
 
 def representative(law: str, plant: str, setting: EvaluationConfig) -> tuple[str, State]:
-    """A start to show a law with both regulators by, with what it is in words.
+    """Returns description and initial state of a run that represents a law with both regulators.
 
-    Exactly hanging at rest, for a law that starts from there. For one that does not, of the starts that both catch with
-    the printed gains the one whose longer settling time is the median; or the set's first start if there is none.
+    Hanging exactly at rest, for a law that leaves that equilibrium. For other laws, of the initial states from which
+    both regulators settle with the printed gains, the one whose longer settling time is the median; the set's first if
+    there is none.
+
+    Args:
+      law: a key of `cpjax.paper.LAWS`.
+      plant: a key of `cpjax.paper.PLANTS`.
+      setting: configuration of the evaluation.
     """
     if law.startswith("corrected") and law != "corrected-as-voltage":
         return "exactly hanging at rest", HANGING
@@ -116,7 +131,15 @@ def representative(law: str, plant: str, setting: EvaluationConfig) -> tuple[str
 
 
 def trajectory(law: str, design: paper.Design, plant: str, start: State, setting: EvaluationConfig) -> Trajectory:
-    """One rollout with the printed gains, under the protocol."""
+    """Simulates one run with the printed gains, under the protocol.
+
+    Args:
+      law: a key of `cpjax.paper.LAWS`.
+      design: "lqr" or "placement".
+      plant: a key of `cpjax.paper.PLANTS`.
+      start: the initial state.
+      setting: configuration of the evaluation.
+    """
     model = paper.PLANTS[plant]()
     controller = paper.controller(law, design, model)
     return rollout(model, controller, start, duration=setting.duration, dt=setting.dt, clock="sampled")
@@ -133,13 +156,13 @@ def _document(setting: EvaluationConfig, rows: list[dict[str, Any]]) -> dict[str
 
 
 def _resume(path: Path, setting: EvaluationConfig) -> list[dict[str, Any]]:
-    """Rows of an interrupted run with the same setting and versions."""
+    """Returns the rows of an interrupted run with the same setting and versions, or none."""
     if not path.exists():
         return []
     try:
         document = io.read_table(path)
     except InputError:
-        return []  # something else, or broken: it is overwritten by the first row
+        return []  # another kind of file, or broken: the first row overwrites it
     expected = _document(setting, [])
     same = all(document.get(key) == expected[key] for key in ("what", "versions", "setting"))
     rows = document.get("rows")

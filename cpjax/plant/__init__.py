@@ -1,4 +1,4 @@
-"""What stands on the bench: the state and its conventions, cart-pole and motor, the linear model, initial states."""
+"""Plant layer: the state and its conventions, cart-pole and motor, the linear model, initial states."""
 
 from cpjax.plant.cartpole import CartPole
 from cpjax.plant.initial_states import sample_starts

@@ -5,7 +5,7 @@ b = pivot_friction and F the horizontal force of the wheels, the Lagrangian
 
     L = 1/2 M x'^2 + 1/2 m ((x' - l th' cos th)^2 + (l th' sin th)^2) + 1/2 J th'^2 - m g l cos th
 
-gives (paper, section III, with its sign error mended; see docs/paper.md)
+gives (paper, section III, with its sign error corrected; see docs/paper.md)
 
     (M + m) x'' - m l cos(th) th'' = F - c x' - m l sin(th) th'^2
     (J + m l^2) th'' - m l cos(th) x'' = m g l sin(th) - b th'
@@ -26,23 +26,23 @@ from cpjax.plant.state import ANGLE_LIMIT, NAMES, RUNAWAY_LIMIT, UNITS, State
 from cpjax.pytree import Number, Scalar, number, part, pytree
 
 Pair: TypeAlias = tuple[Scalar, Scalar]
-"""One number for the cart, one for the pole."""
+"""Pair of scalars: cart, pole."""
 
-# Sizes at which a parameter that is zero would matter on a plant: declared below, at the fields.
+# Reference sizes of parameters whose value may be zero; the fields below declare them (`typical`, `drawn`).
 
 
 def _swing(plant: "CartPole") -> float:
-    """The inertia of a point bob about the pivot, m l^2."""
+    """Returns the inertia of a point bob about the pivot, m l^2 [kg m^2]."""
     return float(plant.pole_mass) * float(plant.pole_length) ** 2
 
 
 def _pivot_damping(plant: "CartPole") -> float:
-    """That of a point bob of quality factor 1, m l^2 sqrt(g / l)."""
+    """Returns the pivot friction of a point bob with quality factor 1, m l^2 sqrt(g / l) [N m s/rad]."""
     return _swing(plant) * math.sqrt(float(plant.gravity) / float(plant.pole_length))
 
 
 def _fifth_of_critical_damping(plant: "CartPole") -> float:
-    """Of the pendulum, 0.4 sqrt(m g l (J + m l^2))."""
+    """Returns a fifth of the pendulum's critical damping, 0.4 sqrt(m g l (J + m l^2)) [N m s/rad]."""
     weight = float(plant.pole_mass) * float(plant.gravity) * float(plant.pole_length)
     return 0.4 * math.sqrt(weight * float(plant.pivot_inertia))
 
@@ -81,10 +81,15 @@ class CartPole:
 
     @classmethod
     def rod(cls, *, mass: Scalar, length: Scalar, **others: Any) -> "CartPole":
-        """A uniform rod of `mass` [kg] and whole `length` [m] on the pivot: l = length / 2, J = mass length^2 / 12.
+        """Builds a cart-pole whose pole is a uniform rod on the pivot: l = length / 2, J = mass length^2 / 12.
 
         Args:
+          mass: of the rod [kg].
+          length: of the whole rod [m].
           others: the remaining fields of `CartPole`.
+
+        Raises:
+          InputError: a value outside its range.
         """
         mass = Number("kg", "mass of the rod", above=0.0).normalise("CartPole.rod: mass", mass)
         length = Number("m", "length of the rod", above=0.0).normalise("CartPole.rod: length", length)
@@ -92,17 +97,17 @@ class CartPole:
 
     @property
     def limits(self) -> State:
-        """The largest magnitude of each component of the state; a rollout that goes beyond is stopped."""
+        """Largest allowed magnitude of each component of the state; a rollout that exceeds one is stopped."""
         return State(RUNAWAY_LIMIT, RUNAWAY_LIMIT, ANGLE_LIMIT, RUNAWAY_LIMIT)
 
     @property
     def units(self) -> dict[str, str]:
-        """Units of the state's components, by name, for error messages."""
+        """Units of the state's components by name, for error messages."""
         return dict(zip(NAMES, UNITS, strict=True))
 
     @property
     def input_limit(self) -> Scalar:
-        """The voltage at which the drive clips [V]."""
+        """Voltage at which the drive clips [V]."""
         return self.motor.voltage_limit
 
     def coordinates(self, state: State) -> tuple[Pair, Pair]:
@@ -114,15 +119,20 @@ class CartPole:
         return State(q[0], v[0], q[1], v[1])
 
     def saturate(self, command: Scalar) -> Scalar:
-        """Returns the terminal voltage [V] that the drive makes of a command: see `Motor.saturate`."""
+        """Returns the terminal voltage [V] that the drive applies for a commanded voltage [V]: see `Motor.saturate`."""
         return real("plant.motor.saturate", call("plant.motor", self.motor, "saturate", command))
 
     def geometry(self, q: Pair) -> Pair:
-        """Returns sine and cosine of theta: all that the accelerations need of the positions."""
+        """Returns sine and cosine of theta, the only functions of the positions in the accelerations."""
         return sin_cos(q[1])
 
     def geometry_near(self, geometry: Pair, change: Pair) -> tuple[Pair, jax.Array]:
-        """Returns sine and cosine after a `change` of the positions, and whether that is accurate to rounding."""
+        """Returns sine and cosine of theta after a `change` of the positions, and whether they are rounding-accurate.
+
+        Args:
+          geometry: sine and cosine before the change.
+          change: of (x, theta) [m, rad].
+        """
         turn = jnp.asarray(change[1])
         accurate = jnp.abs(turn) <= LARGEST_TURN
         return rotate_by(jnp.asarray(geometry[0]), jnp.asarray(geometry[1]), turn), accurate
@@ -138,29 +148,29 @@ class CartPole:
         return self.acceleration(*geometry, v, force)
 
     def outputs(self, state: State, acceleration: Pair, u: Scalar) -> dict[str, Scalar]:
-        """Returns what a trajectory keeps beside state and voltage: x'' as `cart_acceleration` [m/s^2]."""
+        """Returns what a trajectory saves beside state and voltage: x'' as `cart_acceleration` [m/s^2]."""
         return {"cart_acceleration": acceleration[0]}
 
     @property
     def moving_mass(self) -> Scalar:
-        """Cart and reflected rotor together, M [kg]."""
+        """Mass of the cart plus the reflected mass of the rotor, M [kg]."""
         return self.cart_mass + self.motor.reflected_mass
 
     @property
     def pivot_inertia(self) -> Scalar:
-        """The pole's inertia about its pivot, J + m l^2 [kg m^2]."""
+        """Inertia of the pole about its pivot, J + m l^2 [kg m^2]."""
         return self.pole_inertia + self.pole_mass * self.pole_length * self.pole_length
 
     def acceleration(
         self, sin: Scalar, cos: Scalar, rates: tuple[Scalar, Scalar], force: Scalar
     ) -> tuple[Scalar, Scalar]:
-        """Accelerations `(x'', theta'')` [m/s^2, rad/s^2]: the equations of motion in the module's docstring, solved.
+        """Solves the equations of motion in the module's docstring for `(x'', theta'')` [m/s^2, rad/s^2].
 
         Args:
           sin: sine of theta.
           cos: cosine of theta.
           rates: `(x_dot, theta_dot)` [m/s, rad/s].
-          force: of the wheels on the cart [N].
+          force: horizontal force of the wheels on the cart [N].
         """
         x_dot, theta_dot = rates
         m, inertia = self.pole_mass, self.pivot_inertia
@@ -177,14 +187,14 @@ class CartPole:
         return x_ddot, theta_ddot
 
     def vector_field(self, state: State, voltage: Scalar) -> State:
-        """Time derivative of `state` under the applied (already clipped) terminal `voltage` [V]."""
+        """Returns the time derivative of `state` under the applied (already clipped) terminal `voltage` [V]."""
         sin, cos = sin_cos(state.theta)
         force = self.motor.force(voltage, state.x_dot)
         x_ddot, theta_ddot = self.acceleration(sin, cos, (state.x_dot, state.theta_dot), force)
         return State(state.x_dot, x_ddot, state.theta_dot, theta_ddot)
 
     def force_for_acceleration(self, state: State, x_ddot: Scalar) -> Scalar:
-        """Wheel force [N] under which the cart accelerates with `x_ddot` [m/s^2]: the equations of motion, inverted."""
+        """Returns the wheel force [N] under which the cart accelerates with `x_ddot` [m/s^2] (inverse dynamics)."""
         sin, cos = sin_cos(state.theta)
         ml = self.pole_mass * self.pole_length
         torque = ml * self.gravity * sin - self.pivot_friction * state.theta_dot
@@ -197,23 +207,23 @@ class CartPole:
         )
 
     def kinetic_energy(self, state: State) -> Scalar:
-        """Of cart, rotor and pole [J]."""
+        """Returns the kinetic energy of cart, rotor and pole [J]."""
         _, cos = sin_cos(state.theta)
         coupling = self.pole_mass * self.pole_length * cos * state.x_dot * state.theta_dot
         cart = 0.5 * (self.moving_mass + self.pole_mass) * state.x_dot * state.x_dot
         return cart - coupling + 0.5 * self.pivot_inertia * state.theta_dot * state.theta_dot
 
     def potential_energy(self, state: State) -> Scalar:
-        """m g l cos(theta) [J]: zero at the pivot's height."""
+        """Returns the potential energy m g l cos(theta) [J], zero at the pivot's height."""
         _, cos = sin_cos(state.theta)
         return self.pole_mass * self.gravity * self.pole_length * cos
 
     def total_energy(self, state: State) -> Scalar:
-        """Kinetic and potential [J]."""
+        """Returns the sum of kinetic and potential energy [J]."""
         return self.kinetic_energy(state) + self.potential_energy(state)
 
     def pendulum_energy(self, state: State) -> Scalar:
-        """Energy of the pole about a pivot at rest [J]; zero upright at rest, -2 m g l hanging at rest.
+        """Returns the energy of the pole about a pivot at rest [J]; zero upright at rest, -2 m g l hanging at rest.
 
         E = 1/2 (J + m l^2) theta'^2 + m g l (cos(theta) - 1)        (paper, section IV-C)
         """
@@ -222,6 +232,6 @@ class CartPole:
         return 0.5 * self.pivot_inertia * state.theta_dot * state.theta_dot + weight * (cos - 1.0)
 
     def dissipated_power(self, state: State) -> Scalar:
-        """Power lost in the cart's and the pivot's friction [W]; the motor's own losses are inside the wheel force."""
+        """Returns the power lost in cart and pivot friction [W]; the motor's losses are part of the wheel force."""
         cart = self.cart_friction * state.x_dot * state.x_dot
         return cart + self.pivot_friction * state.theta_dot * state.theta_dot

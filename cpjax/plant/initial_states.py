@@ -1,7 +1,7 @@
-"""The evaluation protocol's sets of starts, seeded.
+"""Seeded random initial states of the evaluation protocol.
 
-Random numbers come from NumPy's PCG64, not from JAX, so that a seed names the same starts in float32 and float64, on
-every backend and with every JAX release.
+Random numbers come from NumPy's PCG64, not from JAX, so that a seed gives the same initial states in float32 and
+float64, on every backend and with every JAX release.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 from cpjax.errors import InputError
 from cpjax.plant.state import HANGING, NAMES, State
 
-# Centre and half-width of each component, uniform in between.
+# Centre and half-width of the uniform distribution of each component.
 _SETS: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "hanging": {"x": (0.0, 0.1), "x_dot": (0.0, 0.0), "theta": (math.pi, 0.3), "theta_dot": (0.0, 0.3)},
     "anywhere": {"x": (0.0, 0.3), "x_dot": (0.0, 0.5), "theta": (0.0, math.pi), "theta_dot": (0.0, 4.0)},
@@ -23,20 +23,24 @@ _SETS: Mapping[str, Mapping[str, tuple[float, float]]] = {
 _MOST = 10**8  # 3 GB of float64
 
 START_SETS = tuple(_SETS)
-"""Names that `sample_starts` knows."""
+"""Names that `sample_starts` accepts."""
 
 
 def sample_starts(name: str, count: int, *, seed: int, dtype: Any = np.float64) -> State:
-    """`count` starts drawn from a named set, as a State of NumPy arrays of shape (count,).
+    """Draws `count` initial states from a named set, as a State of NumPy arrays of shape (count,).
 
     hanging: |x| <= 0.1 m, x_dot = 0, theta = pi +- 0.3 rad, |theta_dot| <= 0.3 rad/s.
     anywhere: |x| <= 0.3 m, |x_dot| <= 0.5 m/s, theta anywhere on the circle, |theta_dot| <= 4 rad/s.
     rest: exactly hanging at rest, `count` times.
 
-    A larger count with the same seed begins with the same starts.
+    A larger count with the same seed begins with the same initial states.
+
+    Args:
+      name: one of `START_SETS`.
+      dtype: float32 or float64; the numbers are drawn in float64 and then cast.
 
     Raises:
-      InputError: an unknown set, a count outside 1 to 10^8, a negative seed, or a dtype that is no float.
+      InputError: an unknown set, a count outside 1 to 10^8, a negative seed, or another dtype.
     """
     check_starts(name, count, seed)
     if not any(dtype is kind or dtype == np.dtype(kind) for kind in (np.float32, np.float64)):
@@ -47,10 +51,10 @@ def sample_starts(name: str, count: int, *, seed: int, dtype: Any = np.float64) 
 
 
 def check_starts(name: Any, count: Any, seed: Any) -> None:
-    """What `sample_starts` asks of these, without drawing any.
+    """Checks arguments of `sample_starts` without drawing.
 
     Raises:
-      InputError: as there.
+      InputError: as `sample_starts` does.
     """
     if not isinstance(name, str) or name not in _SETS:
         raise InputError("starts", name, "one of " + ", ".join(_SETS))

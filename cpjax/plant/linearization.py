@@ -1,4 +1,4 @@
-"""The plant's linear model about an equilibrium."""
+"""Linear model of the plant about an equilibrium."""
 
 from typing import Literal, NamedTuple
 
@@ -13,7 +13,7 @@ from cpjax.pytree import check, is_traced
 
 
 class LinearModel(NamedTuple):
-    """s' = A s + B u about an equilibrium, in the state order x, x_dot, theta, theta_dot."""
+    """Linear model s' = A s + B u about an equilibrium, in the state order x, x_dot, theta, theta_dot."""
 
     A: jax.Array
     """Shape (4, 4)."""
@@ -22,13 +22,14 @@ class LinearModel(NamedTuple):
 
 
 def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | State = "upright") -> LinearModel:
-    """A (4, 4) and B (4, 1) of the plant about an equilibrium with zero voltage, by forward differentiation.
+    """Computes A (4, 4) and B (4, 1) of the plant about an equilibrium at zero voltage, by forward differentiation.
 
     Args:
-      equilibrium: "upright", "hanging", or a State at rest in which nothing accelerates (the cart may stand anywhere).
+      equilibrium: "upright", "hanging", or a State at rest with zero accelerations (at any cart position).
 
     Raises:
-      InputError: `equilibrium` is another word, or a concrete State that is none.
+      InputError: `plant` is no CartPole or has no finite linear model, or `equilibrium` is another word or a concrete
+        State that is not an equilibrium.
     """
     if not isinstance(plant, CartPole):
         raise InputError("plant", plant, "a cpjax.CartPole")
@@ -52,7 +53,7 @@ def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | Stat
     if not is_traced(A) and not is_traced(drift):
         if np.all(np.isfinite(vector)) and not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
             raise InputError("plant", plant, "one with a finite linear model; no gain can be computed for this one")
-        # What A makes of a displacement by 1e-6: more than float32 misses pi by, less than a linear model would notice.
-        if not np.max(np.abs(drift)) <= 1e-6 * np.max(np.abs(A)):  # NaN is refused too
+        # Tolerance: the effect of a displacement by 1e-6, above the float32 error of pi, negligible in a linear model.
+        if not np.max(np.abs(drift)) <= 1e-6 * np.max(np.abs(A)):  # refuses NaN too
             raise InputError("equilibrium", equilibrium, "a state at rest in which nothing accelerates")
     return LinearModel(A, B[:, None])

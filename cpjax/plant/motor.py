@@ -1,4 +1,4 @@
-"""The drive: a DC motor without inductance, a gear and a wheel."""
+"""Drive: a DC motor without inductance, a gear and a wheel."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from cpjax.pytree import Scalar, number, pytree
 
 
 def _at_the_rotor(of_the_cart: float, plant: Any) -> Scalar:
-    """A mass or a damping of the cart as one of the rotor."""
+    """Converts a mass or damping of the cart to the equivalent inertia or damping at the rotor."""
     return of_the_cart * (plant.motor.wheel_radius / plant.motor.gear_ratio) ** 2
 
 
@@ -17,7 +17,7 @@ def _at_the_rotor(of_the_cart: float, plant: Any) -> Scalar:
 class Motor:
     """A DC motor without inductance, a gear and a wheel that does not slip. Defaults: the paper's appendix.
 
-    Terminal voltage u gives the current i = (u - k_V n x' / r) / R, and the wheels push the cart with
+    A terminal voltage u drives the current i = (u - k_V n x' / r) / R, and the wheels exert on the cart the force
     F = n k_T i / r - n^2 B_m x' / r^2.
     """
 
@@ -29,7 +29,7 @@ class Motor:
         at_least=0.0,
         uncertain=True,
         typical=lambda plant: plant.motor.torque_constant,
-        drawn=0.0,  # a motor without back-EMF is an idealisation, not one whose back-EMF happens to be small
+        drawn=0.0,  # zero back-EMF is an idealised model, not a motor with a small, uncertain back-EMF
     )
     resistance: Scalar = number("ohm", "resistance of the winding, R", default=1.25, above=0.0, uncertain=True)
     rotor_inertia: Scalar = number(
@@ -53,15 +53,15 @@ class Motor:
     )
 
     def saturate(self, voltage: Scalar) -> jax.Array:
-        """The demanded voltage [V] clipped to the supply. Derivative 1 inside, 0 outside, 1/2 exactly on the limit."""
+        """Clips the demanded voltage [V] to the supply; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
         return fast_maximum(-self.voltage_limit, fast_minimum(self.voltage_limit, voltage))
 
     def current(self, voltage: Scalar, x_dot: Scalar) -> Scalar:
-        """Current in the winding [A] at an applied voltage [V] and cart velocity [m/s]."""
+        """Returns the winding current [A] at an applied voltage [V] and cart velocity [m/s]."""
         return (voltage - self.back_emf_constant * self.gear_ratio / self.wheel_radius * x_dot) / self.resistance
 
     def force(self, voltage: Scalar, x_dot: Scalar) -> Scalar:
-        """Horizontal force of the wheels on the cart [N].
+        """Returns the horizontal force of the wheels on the cart [N].
 
         F = (n k_T / (R r)) u - n^2 (B_m + k_T k_V / R) x' / r^2        (paper, section III; r = 1 m and n = 1 there)
 
@@ -72,22 +72,22 @@ class Motor:
         return self.force_per_voltage * voltage - self.damping * x_dot
 
     def voltage_for_force(self, force: Scalar, x_dot: Scalar) -> Scalar:
-        """Terminal voltage [V] at which the wheels push with `force` [N] at cart velocity `x_dot` [m/s]; unclipped."""
+        """Returns the unclipped terminal voltage [V] for a wheel force `force` [N] at cart velocity `x_dot` [m/s]."""
         return (force + self.damping * x_dot) * (1.0 / self.force_per_voltage)
 
     @property
     def force_per_voltage(self) -> Scalar:
-        """n k_T / (R r) [N/V]."""
+        """Wheel force per terminal voltage, n k_T / (R r) [N/V]."""
         return self.gear_ratio * self.torque_constant / (self.resistance * self.wheel_radius)
 
     @property
     def damping(self) -> Scalar:
-        """Bearing friction and back-EMF together, as a damping of the cart [N s/m]: n^2 (B_m + k_T k_V / R) / r^2."""
+        """Damping of the cart by bearing friction and back-EMF together [N s/m]: n^2 (B_m + k_T k_V / R) / r^2."""
         ratio = self.gear_ratio / self.wheel_radius
         return ratio * ratio * (self.viscous_friction + self.torque_constant * self.back_emf_constant / self.resistance)
 
     @property
     def reflected_mass(self) -> Scalar:
-        """The rotor's inertia as a mass at the cart [kg]: n^2 J_m / r^2."""
+        """Rotor inertia as an equivalent mass at the cart [kg]: n^2 J_m / r^2."""
         ratio = self.gear_ratio / self.wheel_radius
         return ratio * ratio * self.rotor_inertia

@@ -1,4 +1,4 @@
-"""The numbers of a plant and its motor, by name."""
+"""Access by name to the numbers of a plant and its motor."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -10,21 +10,21 @@ from cpjax.pytree import Number, Scalar, numbers
 
 
 def parameters_of(plant: CartPole) -> dict[str, Number]:
-    """The declared numbers of a plant and its motor, by name, in order."""
+    """Returns the declarations of the plant's and the motor's numbers by name, in order."""
     return numbers(type(plant), type(plant.motor))
 
 
 def parameter(plant: CartPole, name: str) -> Scalar:
-    """The value of a number of the plant or of its motor."""
+    """Returns the value of a number of the plant or of its motor."""
     value: Scalar = getattr(plant if name in numbers(type(plant)) else plant.motor, name)
     return value
 
 
 def with_parameters(plant: CartPole, values: Mapping[str, Any]) -> CartPole:
-    """The plant with some of its or its motor's numbers replaced.
+    """Returns the plant with some of its or its motor's numbers replaced.
 
     Raises:
-      InputError: a name that neither declares, or a concrete value outside its range.
+      InputError: a name that neither of them declares, or a concrete value outside its range.
     """
     own, motor = numbers(type(plant)), numbers(type(plant.motor))
     for name in values:

@@ -1,8 +1,8 @@
-"""The state of cart and pendulum, and every convention about it.
+"""State of cart and pendulum, and its conventions.
 
-Order x, x_dot, theta, theta_dot. theta = 0 is upright, pi hangs down, and positive theta leans towards negative x: the
-pole's centre of mass is at (x - l sin(theta), l cos(theta)). Angles in rad, all else in SI units. theta is not wrapped
-while it evolves; whatever needs it modulo a turn says so.
+The order is x, x_dot, theta, theta_dot. theta = 0 is upright, theta = pi hangs down, and positive theta leans towards
+negative x: the pole's centre of mass is at (x - l sin(theta), l cos(theta)). Angles are in rad, all else in SI units.
+theta is not wrapped during a simulation; functions that use it modulo a turn say so.
 """
 
 import math
@@ -19,10 +19,10 @@ UNITS = ("m", "m/s", "rad", "rad/s")
 
 @pytree
 class State:
-    """Four named scalars. Under `vmap` each becomes its own array, which is the layout that vector hardware wants.
+    """State as four named scalars. Under `vmap` each becomes an array of its own, the layout suited to vector hardware.
 
-    A State also carries what has its shape: a time derivative, a reference, a tangent. It is therefore not checked
-    when constructed; `rollout` and `sweep` check the start they are given.
+    The class also holds time derivatives, references and tangents. It is therefore not checked when constructed;
+    `rollout` and `sweep` check the initial states that they are given.
 
     Attributes:
       x: cart position [m].
@@ -37,17 +37,17 @@ class State:
     theta_dot: Scalar
 
     def vector(self) -> jax.Array:
-        """The state as an array (..., 4) in the order of `NAMES`."""
+        """Returns the state as an array (..., 4) in the order of `NAMES`."""
         return jnp.stack([jnp.asarray(getattr(self, name)) for name in NAMES], axis=-1)
 
     @classmethod
     def from_vector(cls, vector: jax.Array) -> "State":
-        """The state held in the last axis of an array (..., 4)."""
+        """Builds a state from the last axis of an array (..., 4)."""
         return cls(*(vector[..., i] for i in range(4)))
 
 
 def deviation(state: State, reference: State) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """`state` less `reference`, in the order of `NAMES`, with the angle's difference taken modulo a turn."""
+    """Returns `state` minus `reference` in the order of `NAMES`, with the angle difference wrapped to [-pi, pi]."""
     return (
         state.x - reference.x,
         state.x_dot - reference.x_dot,
@@ -57,7 +57,10 @@ def deviation(state: State, reference: State) -> tuple[Scalar, Scalar, Scalar, S
 
 
 def checked_reference(field: str, reference: State) -> State:
-    """A State that is a component's parameter, checked as its other parameters are.
+    """Returns a State that is a parameter of a controller, with each component checked like a declared number.
+
+    Args:
+      field: name of the parameter in error messages.
 
     Raises:
       InputError: a component that is not a finite number.
@@ -67,14 +70,14 @@ def checked_reference(field: str, reference: State) -> State:
 
 
 UPRIGHT = State(0.0, 0.0, 0.0, 0.0)
-"""Balanced at rest in the middle of the track."""
+"""Upright at rest in the middle of the track."""
 
 HANGING = State(0.0, 0.0, math.pi, 0.0)
 """Hanging at rest in the middle of the track."""
 
 
 RUNAWAY_LIMIT = 1e3
-"""Bound on |x| [m], |x_dot| [m/s] and |theta_dot| [rad/s], far outside what 12 V can do in the protocol's 20 s."""
+"""Bound on |x| [m], |x_dot| [m/s] and |theta_dot| [rad/s], far beyond what 12 V can reach in the protocol's 20 s."""
 
 ANGLE_LIMIT = 1e5
-"""Bound on |theta| [rad]; up to there sine and cosine of it mean something in float32."""
+"""Bound on |theta| [rad], up to which its sine and cosine are meaningful in float32."""

@@ -44,14 +44,14 @@ class Known(NamedTuple):
 
 def fronts(
     curves: Mapping[str, Mapping[str, Curve]],
-    bland: Mapping[str, Mapping[str, np.ndarray[Any, Any]]],
+    baseline: Mapping[str, Mapping[str, np.ndarray[Any, Any]]],
     known: Mapping[str, Sequence[Known]],
 ) -> Figure:
     """Draws one panel per cost: the fronts, the baselines as stars, and known controllers as hollow points.
 
     Args:
       curves: by cost and design.
-      bland: by cost and design, the baseline's mean settling time [s] and mean cost (2,); not drawn if not finite.
+      baseline: by cost and design, the baseline's mean settling time [s] and mean cost (2,); not drawn if not finite.
       known: by cost.
     """
     figure = Figure(figsize=(5.2 * len(curves), 5.6), layout="constrained")
@@ -59,7 +59,7 @@ def fronts(
     for axes, (cost, designs) in zip(panels, curves.items(), strict=True):
         for design, curve in designs.items():
             _draw(axes, design, curve)
-        for design, point in bland[cost].items():
+        for design, point in baseline[cost].items():
             if np.all(np.isfinite(point)):
                 axes.plot(
                     *point, "*", color=DESIGN_COLOURS[design], markersize=11, label=f"{DESIGN_NAMES[design]}, baseline"
@@ -67,7 +67,7 @@ def fronts(
         # The view holds fronts, baselines and controllers that nearly always settle; others are drawn at its edge.
         good = [(one.time, one.cost) for one in known[cost] if one.success > 0.9]
         found = [np.concatenate([curve.traced, curve.random]) for curve in designs.values()]
-        shown = np.concatenate([*found, np.reshape([*bland[cost].values(), *good], (-1, 2))])
+        shown = np.concatenate([*found, np.reshape([*baseline[cost].values(), *good], (-1, 2))])
         low, high = _view(shown)
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])

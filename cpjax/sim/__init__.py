@@ -1,1 +1,1 @@
-"""The loop: integrators, the closed-loop step, rollouts, metrics and sweeps."""
+"""Closed-loop simulation: integrators, the closed-loop step, rollouts, metrics and sweeps."""

@@ -1,7 +1,7 @@
-"""Plant and controller as a `System` of smooth modes: what located switching integrates.
+"""Plant and controller as a `System` of smooth modes, in the form that located switching integrates.
 
-On the continuous clock the guards are the two ends of the supply, the controller's margin, and the plant's own; on the
-sampled clock, on which the input is held, only the plant's own.
+On the continuous clock the guards are the two voltage limits, the controller's margin and the plant's own guards; on
+the sampled clock, on which the input is held, only the plant's own.
 """
 
 from typing import Any, NamedTuple, TypeAlias
@@ -19,19 +19,19 @@ from cpjax.sim.stepper import dtype_of
 from cpjax.sim.switching import Guards, Observation
 
 UPPER, LOWER, GATE = 0, 1, 2
-"""Numbers of the guards on the continuous clock: the ends of the supply, and the controller's margin."""
+"""Indices of the guards on the continuous clock: the two voltage limits and the controller's margin."""
 
 GATE_CROSSING = GATE + 1
-"""`Sample.crossing` at a located change of the controller's mode."""
+"""Value of `Sample.crossing` at a located change of the controller's mode."""
 
 
 class Mode(NamedTuple):
-    """In which the closed loop is smooth on the continuous clock."""
+    """Mode in which the closed loop is smooth, on the continuous clock."""
 
     law: jax.Array
     """The controller's mode, int32."""
     clip: jax.Array
-    """Where the demanded voltage is: 1 above the limit, -1 below it, 0 inside, int32."""
+    """Saturation of the demanded voltage: 1 above the upper limit, -1 below the lower one, 0 inside, int32."""
     plant: Tree
     """The plant's own mode."""
 
@@ -39,8 +39,8 @@ class Mode(NamedTuple):
 class ContinuousLoop(NamedTuple):
     """Plant and controller on the continuous clock. Its output is the applied voltage.
 
-    The plant's drive has to clip at `plant.input_limit`, and do nothing else: where the demand reaches it is a guard
-    too.
+    The plant's drive must clip at `plant.input_limit` and do nothing else, because the instant at which the demand
+    reaches that limit is located by a guard.
     """
 
     plant: Any
@@ -66,7 +66,8 @@ class ContinuousLoop(NamedTuple):
         successor = integer("controller.successor", call("controller", self.controller, "successor", mode.law))
         law = jnp.where(guard == GATE, successor, mode.law)
         now = self._clip(state, law)
-        # On the limit itself rounding has the sign. A demand that has jumped past the other limit is beyond that one.
+        # On the limit itself the sign is rounding error and is ignored. A demand that has jumped past the other limit
+        # is clipped there.
         inside = jnp.where(now == -mode.clip, now, 0)
         clip = jnp.where(mode.clip == 0, jnp.where(guard == UPPER, 1, -1), inside)
         clip = jnp.where(guard == GATE, now, clip).astype(mode.clip.dtype)
@@ -77,7 +78,7 @@ class ContinuousLoop(NamedTuple):
         q, v, of_plant = jax.tree.map(
             lambda new, old: jnp.where(own, new, old), (after_q, after_v, after), (q, v, mode.plant)
         )
-        # A jump of the plant's state may move the demand over a limit.
+        # A jump of the plant's state may move the demand beyond a limit.
         clip = jnp.where(own, self._clip(plants.state_of(self.plant, q, v), law).astype(clip.dtype), clip)
         return q, v, Mode(law, clip, of_plant)
 
@@ -95,16 +96,16 @@ class ContinuousLoop(NamedTuple):
 
 
 class HeldMode(NamedTuple):
-    """In which the plant is smooth between two control instants."""
+    """Mode in which the plant is smooth between two control instants."""
 
     u: jax.Array
-    """The input, held."""
+    """The held input."""
     plant: Tree
     """The plant's own mode."""
 
 
 class HeldLoop(NamedTuple):
-    """A plant with events of its own under a held input. Its output is the input."""
+    """A plant with events of its own, under a held input. Its output is the input."""
 
     plant: Plant
 
@@ -121,13 +122,17 @@ System: TypeAlias = ContinuousLoop | HeldLoop
 
 
 def plant_accelerations(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Tree:
-    """Returns q''."""
+    """Returns the accelerations q'' under the input `u`, in the plant's own mode."""
     geometry = plants.geometry(plant, q)
     return outline(plants.accelerations)(plant, geometry, v, u, mode)
 
 
 def plant_guards(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Guards:
-    """Returns the plant's own guards, if it has any."""
+    """Returns the plant's own guards, () for a plant without events.
+
+    Raises:
+      InputError: the plant's `guards` returns no tuple of scalars.
+    """
     if not plants.has_events(plant):
         return ()
     guards = call("plant", plant, "guards", q, v, u, mode)
@@ -137,7 +142,11 @@ def plant_guards(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Gu
 
 
 def plant_jump(plant: Any, q: Tree, v: Tree, mode: Tree, guard: jax.Array) -> tuple[Tree, Tree, Tree]:
-    """Returns positions, velocities and the plant's mode after one of its own guards has fallen."""
+    """Returns positions, velocities and the plant's mode after its own guard of this number (int32) has fallen.
+
+    Raises:
+      InputError: the plant's `jump` returns another tree structure.
+    """
     after = call("plant", plant, "jump", q, v, mode, guard)
     found: Any = jax.tree.structure(after)
     if found != jax.tree.structure((q, v, mode)):

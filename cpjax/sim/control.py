@@ -1,4 +1,4 @@
-"""The controller in the loop: its memory, and the input that the drive makes of its command."""
+"""The controller in the loop: its memory, and the input that the drive applies for its command."""
 
 from typing import Any, NamedTuple
 
@@ -17,39 +17,39 @@ from cpjax.sim.stepper import applied_voltage, dtype_of
 
 
 class Blend(NamedTuple):
-    """What the derivative of the mean needs of a control period; see `derivatives.py`."""
+    """Quantities of one control period that the derivative of the mean needs; see `derivatives.py`."""
 
     held: jax.Array
-    """The voltage that would be applied, had the controller's mode not changed."""
+    """Voltage that would be applied, had the controller's mode not changed."""
     shift: jax.Array
-    """By how much of the period that change of mode moves: value 0, with a derivative."""
+    """Shift of that change of mode, as a fraction of the period: value 0, with a derivative."""
     voltage_echo: jax.Array
-    """What the change of mode in the period before adds to the voltage: value 0."""
+    """Contribution to the voltage of the change of mode in the previous period: value 0, with a derivative."""
     memory_echo: tuple[jax.Array, ...]
-    """What this period's change of mode will add to the memory in the next: zeros."""
+    """Contribution of this period's change of mode to the memory in the next one: zeros, with a derivative."""
     mode: jax.Array
-    """The mode until this period, int32."""
+    """Mode until this period, int32."""
 
 
 class Control(NamedTuple):
-    """The controller from a control instant on."""
+    """Memory and voltage of the controller from a control instant on."""
 
     memory: Any
     voltage: jax.Array
-    """What the drive applies."""
+    """Input that the drive applies [V]."""
     blend: Blend | None = None
-    """None unless the derivative of the mean is asked for."""
+    """None unless the derivative of the mean is requested."""
 
     @property
     def applied(self) -> jax.Array:
-        """The voltage, with the derivative that the plant is to see."""
+        """Voltage with the derivative that the plant receives [V]."""
         if self.blend is None:
             return self.voltage
         return shifted(self.voltage, self.blend.held, 1.5 * self.blend.shift) + self.blend.voltage_echo
 
     @property
     def mode(self) -> jax.Array:
-        """The mode that a trajectory records: the first one in the memory, else 0."""
+        """Mode that a trajectory records: the first one in the memory, 0 if there is none."""
         modes = modes_in(self.memory)
         return modes[0].mode if modes else jnp.asarray(0, dtype=jnp.int32)
 
@@ -81,7 +81,7 @@ def update_control(plant: Plant, controller: Any, before: Control, state: Tree, 
         return Control(memory, plants.saturate(plant, command))
     updated, command = _updated(as_sampled(tracked(controller)), memory, state)
     unchanged, other = _updated(as_sampled(holding(controller)), memory, state)
-    # Of the other command the derivative takes the value alone; what it does not need is not carried along.
+    # The derivative uses only the value of the other command, so the command's own derivative is dropped.
     voltage, held = plants.saturate(plant, command), lax.stop_gradient(plants.saturate(plant, other))
     shift = shift_of(updated).astype(voltage.dtype)
     nothing = jnp.zeros_like(voltage)

@@ -1,29 +1,30 @@
 """Derivatives on the sampled clock, where a change of mode falls on a control instant.
 
-Such an instant does not move with a parameter, so plain automatic differentiation leaves out what a change of mode
-does. The mean over initial states moves all the same: the crossing's phase within the control period is as good as
-random, so that a crossing which comes later by dt* delays the change of mode by one whole period T in a share dt*/T of
-all runs. In the mean, the first command of the new mode is thus replaced, to first order, by the one of the old mode to
-the share
+Such an instant does not move with a parameter, so plain automatic differentiation omits the effect of a change of
+mode. The mean over initial states still depends on it: the crossing's phase within the control period is practically
+random, so that a crossing delayed by dt* delays the change of mode by one whole period T in a fraction dt*/T of all
+runs. In the mean, the first command of the new mode is thus replaced, to first order, by that of the old mode in the
+fraction
 
     d(dt*)/T,    dt*/dp = -(dg/dp) / (dg/dt)    where g, the margin of the old mode, crosses zero.
 
-This is smoothed perturbation analysis (Gong and Ho, 1987) of the hybrid loop. The crossing is where the straight line
-through the margins at the two control instants about it vanishes, so both values and derivatives are those at the
-crossing, to first order in T.
+This is smoothed perturbation analysis (Gong and Ho, 1987) of the hybrid loop. The crossing is located at the zero of
+the straight line through the margins at the two neighbouring control instants, so both values and derivatives are those
+at the crossing, to first order in T.
 
-A command that is held over a period acts in its middle on average, half a period after the change of mode that it
-stands for. So 3/2 of the difference is put into the period of the change, and -1/2 into the next, whose mean is the
-instant of the change. That makes the error of the mean one of second order in T.
+A command held over a period acts on average at the period's middle, half a period after the change of mode that it
+represents. So 3/2 of the difference is assigned to the period of the change and -1/2 to the next one; their weighted
+mean is the instant of the change. This makes the error of the mean second order in T.
 
-Whatever sits in the loop, estimator, delay or memory, the command that the old mode would have led to is found by
-running the controller a second time with its mode held. The parts that have a mode are found inside any controller and
-replaced, by one that also tracks its margin (`Tracked`) and one that holds its mode (`Holding`).
+For any controller, also with estimator, delay or memory, the command of the old mode is computed by running the
+controller a second time with its mode held. The parts with a mode are found inside any controller and replaced by one
+that also tracks its margin (`Tracked`) and by one that holds its mode (`Holding`).
 
-Three limits. The plant has to be affine in its input, as any with a motor is. A metric gets the difference between two
-voltages, but a function of a saved trajectory's voltage gets the slope there. And a command that a controller keeps in
-its memory, to return it later, as a dead time does, is replaced to first order only: a metric that is not linear in the
-voltage, such as the effort, then has the slope of its integrand where it should have the difference.
+There are three limitations. The plant must be affine in its input, as any plant with a motor is. A metric receives the
+difference between two voltages, but a function of a saved trajectory's voltage receives the slope there. And a command
+that a controller stores in its memory to return it later, as a dead time does, is replaced to first order only: a
+metric that is not linear in the voltage, such as the effort, then uses the slope of its integrand instead of the
+difference.
 """
 
 import warnings
@@ -53,7 +54,7 @@ _NEEDS = ("start_mode", "next_mode", "mode_voltage", "margin", "successor")
 
 @pytree
 class Tracked:
-    """A controller with modes that remembers its margin, and says by how much its last change of mode moves."""
+    """A controller with modes whose memory also holds its margin and the shift of its last change of mode."""
 
     controller: SmoothController = part("a controller with modes", *_NEEDS)
 
@@ -79,7 +80,7 @@ class Tracked:
 
 @pytree
 class Holding:
-    """The same controller with its mode held: what it would have commanded, had the mode not changed."""
+    """The same controller with its mode held: it returns the command for an unchanged mode."""
 
     controller: SmoothController = part("a controller with modes", *_NEEDS)
 
@@ -94,17 +95,17 @@ class Holding:
 
 
 def tracked(controller: Any) -> Any:
-    """Returns the controller with every part that has a mode tracked."""
+    """Returns the controller with every part that has a mode wrapped in `Tracked`."""
     return _replaced(controller, Tracked)
 
 
 def holding(controller: Any) -> Any:
-    """Returns the controller with every part that has a mode holding it."""
+    """Returns the controller with every part that has a mode wrapped in `Holding`."""
     return _replaced(controller, Holding)
 
 
 def shift_of(memory: Any) -> jax.Array:
-    """Returns by how much of a control period the change of mode at this instant moves: value 0, with a derivative.
+    """Returns the shift of a change of mode at this instant, in control periods: value 0, with a derivative.
 
     Raises:
       InputError: a part of the controller has a mode, and its margin is not tracked.
@@ -120,8 +121,8 @@ def shift_of(memory: Any) -> jax.Array:
 
 @jax.custom_jvp
 def _moved_crossing(before: jax.Array, after: jax.Array, crossed: jax.Array) -> jax.Array:
-    """Returns 0, with the derivative of `before / (before - after)` where a crossing is, which is where in the period
-    between two margins the crossing is."""
+    """Returns 0 with, where `crossed`, the derivative of the crossing's position in the period between the two margins,
+    `before / (before - after)`."""
     return jnp.where(crossed, jnp.zeros_like(before), jnp.zeros_like(before))
 
 
@@ -135,12 +136,12 @@ def _moved_crossing_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 @jax.custom_jvp
 def shifted(new: Any, old: Any, shift: jax.Array) -> Any:
-    """Returns `new`, whose derivative is also that of replacing it by `old` to the share `shift`, which is 0.
+    """Returns `new` with the derivative of `(1 - shift) * new + shift * old` at `shift` = 0.
 
     Args:
       new, old: trees of one structure.
     """
-    # Written as a choice so that under vmap the value is a batch wherever its derivative is one.
+    # Written with `where` so that under vmap the value is batched wherever its derivative is.
     return jax.tree.map(lambda a: jnp.where(shift == 0.0, a, a), new)
 
 
@@ -152,7 +153,7 @@ def _shifted_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     def moved(new: jax.Array, old: jax.Array, tangent: Any) -> Any:
         if not jnp.issubdtype(jnp.asarray(new).dtype, jnp.floating):
             return tangent
-        jump = _once(old - new)  # of two infinities, such as a settling time that is not known yet, it is NaN
+        jump = _once(old - new)  # NaN for two infinities, such as a settling time that is not known yet
         return tangent + jnp.where(jnp.isfinite(jump), jump, 0.0) * d_shift
 
     return shifted(new, old, shift), jax.tree.map(moved, new, old, d_new)
@@ -160,7 +161,7 @@ def _shifted_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 @jax.custom_jvp
 def _once(jump: jax.Array) -> jax.Array:
-    """Returns its argument, which must not be differentiated again."""
+    """Returns its argument; raises InputError when differentiated, as second derivatives are not supported."""
     return jump
 
 
@@ -171,16 +172,16 @@ def _once_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 def difference(held: Any, updated: Any) -> tuple[jax.Array, ...]:
-    """Returns by how much a controller's memory would differ, had its mode been held: each of its float leaves.
+    """Returns, for each float leaf of a controller's memory, the value with the mode held minus the updated value.
 
-    Modes and their margins are left out: they belong to the mode that was chosen.
+    `ModeMemory` nodes are left out: mode and margin belong to the mode that was chosen.
     """
     pairs = zip(_parts(held), _parts(updated), strict=True)
     return tuple(a - b for a, b in pairs if _is_float(b))
 
 
 def with_zeros(memory: Any, zeros: tuple[jax.Array, ...]) -> Any:
-    """Returns a memory with zeros added to its float leaves, for their derivative; as many as `difference` returns."""
+    """Returns a memory with zeros added to its float leaves for their derivatives, in the order of `difference`."""
     left = iter(zeros)
     parts = [part + next(left) if _is_float(part) else part for part in _parts(memory)]
     return jax.tree.unflatten(jax.tree.structure(memory, is_leaf=_is_mode), parts)
@@ -199,7 +200,7 @@ def _is_float(part: Any) -> bool:
 
 
 def may_switch(controller: Any, start: Any) -> bool:
-    """Whether a controller has a mode, as far as can be seen: a part with modes, or a memory with one."""
+    """Returns whether a controller has a mode that can be detected: a part with modes, or a memory with one."""
 
     def is_modal(node: Any) -> bool:
         return isinstance(node, ModalController) and not isinstance(node, (type, SingleLaw))
@@ -212,7 +213,7 @@ def may_switch(controller: Any, start: Any) -> bool:
 
 
 def watched(tree: Any) -> Any:
-    """Returns the tree; differentiating it warns that the derivative misses the change of mode."""
+    """Returns the tree unchanged; differentiating it warns that the derivative omits the effect of changes of mode."""
     leaves, structure = jax.tree.flatten(tree)
     real_ones = [i for i, leaf in enumerate(leaves) if jnp.issubdtype(getattr(leaf, "dtype", int), jnp.floating)]
     for i, leaf in zip(real_ones, _watched([leaves[i] for i in real_ones]), strict=True):
@@ -242,7 +243,7 @@ def _margin(controller: SmoothController, state: Any, mode: jax.Array) -> jax.Ar
 
 
 def _replaced(controller: Any, kind: type) -> Any:
-    """Returns the controller with every part whose whole memory is a mode in a `kind`.
+    """Returns the controller with every part whose memory is only a mode wrapped in `kind`.
 
     Raises:
       InputError: a part with modes has a memory of its own beside them.

@@ -1,11 +1,11 @@
-"""Holding a run where it goes wrong: the one policy of all loops.
+"""Failure handling, common to all loops: a failed run is held at its last valid state.
 
-A run that would leave the plant's limits, or become non-finite, is held at its last good state and flagged.
+A run that would leave the plant's limits, or become non-finite, is held at its last valid state and flagged.
 
-A derivative in reverse passes through both branches of a `where`, and 0 times an infinity of the branch not taken is
-NaN. So a step that is about to go wrong (told by an Euler step of the velocities) is not taken from where it would: it
-is taken from zero, where all is finite, and dropped. (A law that is itself not finite at a state it is asked about
-still gives NaN derivatives; those of this library are finite.)
+Reverse-mode differentiation passes through both branches of a `where`, and 0 times an infinity of the branch not taken
+is NaN. A step that would fail, as predicted by an Euler step of the velocities, is therefore computed from the zero
+state, where everything is finite, and its result is discarded. (A law that is itself not finite at a state at which it
+is evaluated still gives NaN derivatives; the laws of this library are finite.)
 """
 
 from typing import Any, NamedTuple
@@ -22,27 +22,27 @@ from cpjax.sim.plants import Plant, Tree
 
 
 class Outlook(NamedTuple):
-    """What is known about a step before it is taken."""
+    """Prediction about a step before it is taken."""
 
     possible: jax.Array
     """Whether an Euler step keeps the velocities within the plant's limits."""
     ahead: Tree
-    """The velocities after an Euler step."""
+    """Velocities after an Euler step."""
 
 
 def look_ahead(plant: Plant, v: Tree, acceleration: Tree, dt: Scalar) -> Outlook:
-    """Judges a step by an Euler step of the velocities."""
+    """Predicts a step of `dt` [s] by an Euler step of the velocities."""
     ahead = jax.tree.map(lambda velocity, change: velocity + dt * change, v, acceleration)
     return Outlook(plants.within(ahead, plants.coordinates(plant, plant.limits)[1]), ahead)
 
 
 def is_stopped(flag: jax.Array) -> jax.Array:
-    """Whether a flag has stopped the run."""
+    """Returns whether a flag has stopped the run."""
     return (flag & STOPPED) != 0
 
 
 def safe(going: jax.Array, tree: Any) -> Any:
-    """Returns the tree where the run goes on, and zeros where it does not."""
+    """Returns the tree where the run continues, and zeros where it does not."""
     return jax.tree.map(lambda value: jnp.where(going, value, jnp.zeros((), jnp.asarray(value).dtype)), tree)
 
 

@@ -1,4 +1,4 @@
-"""What can go wrong in a rollout. Inside `jit` nothing raises, so it is written down instead."""
+"""Status flags of a rollout. Code under `jit` cannot raise, so failures are reported as bits."""
 
 import enum
 from typing import Any
@@ -14,31 +14,31 @@ class Flag(enum.IntFlag):
     """Bits of `Trajectory.flag` and `Metrics.flag`; 0 is a clean run."""
 
     RUNAWAY = 1
-    """The state left, or was about to leave, the bounds of the plant (`limits`). It was held at its last value
-    inside."""
+    """The state left, or was about to leave, the bounds of the plant (`limits`). It was held at its last value within
+    them."""
 
     NON_FINITE = 2
-    """A parameter or the next state was NaN or infinite. The state was held at its last finite value."""
+    """A parameter was NaN, or the next state NaN or infinite. The state was held at its last finite value."""
 
     CHATTERING = 4
-    """The mode changed at CHATTER_LENGTH control instants in a row, or, located, gate and clip so many times within one
-    step. The run went on; a gate wants hysteresis."""
+    """The mode changed at CHATTER_LENGTH control instants in a row or, with located events, as many crossings occurred
+    within one step. The run continued; the usual remedy is hysteresis of the gate."""
 
     OVERFLOW = 8
-    """Located switching used up its spare steps, by many crossings or by chattering. The state was held there."""
+    """Located switching used up its spare steps, by many crossings or chattering. The state was held from there on."""
 
 
 STOPPED = int(Flag.RUNAWAY | Flag.NON_FINITE | Flag.OVERFLOW)
-"""Flags after which the state is held, and the run is no success."""
+"""Flags that freeze the state and make the run a failure."""
 
 CHATTER_LENGTH = 8
 
 NEEDS_RECOMPUTE = 1 << 30
-"""Beside the flags, for `sweep` alone, which then computes the start again: see `Settings.fast_path`."""
+"""Internal bit beside the flags: `sweep` recomputes such a run without the fast path; see `Settings.fast_path`."""
 
 
 def describe(flag: int) -> str:
-    """The flag in words, such as "runaway" or "clean"."""
+    """Returns the flag in words, such as "runaway" or "clean"."""
     names = [bit.name.lower().replace("_", "-") for bit in Flag if int(np.asarray(flag)) & bit and bit.name]
     return ", ".join(names) or "clean"
 

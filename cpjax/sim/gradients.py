@@ -1,4 +1,4 @@
-"""Gradients of an objective at many starts, in chunks, forward or in reverse."""
+"""Gradients of an objective at many initial states, in chunks, in forward or reverse mode."""
 
 import functools
 import math
@@ -15,23 +15,23 @@ from cpjax.sim.initial import checked_tree
 
 Direction: TypeAlias = Literal["reverse", "forward"]
 Objective: TypeAlias = Callable[[Any, State], jax.Array]
-"""A number from parameters and one start, such as an entry of what `cpjax.measure` returns."""
+"""Function of parameters and one initial state that returns a scalar, such as an entry of `cpjax.measure`'s result."""
 
 
 class Gradients(NamedTuple):
-    """Of each start."""
+    """Value and gradient of an objective at each of n initial states."""
 
     value: jax.Array
     """Shape (n,)."""
     gradient: Any
-    """The parameters' tree, each leaf with a leading axis n."""
+    """Tree of the parameters' structure, each leaf with a leading axis n."""
 
     @property
     def finite(self) -> jax.Array:
-        """Whether the value and all numbers of the gradient are finite (n,).
+        """Returns whether the value and all numbers of the gradient are finite (n,).
 
         A derivative can overflow where the run itself is clean: exactly upright at rest, a perturbation grows by
-        powers of ten every second, in float32 soon beyond the largest number. No flag of the run tells.
+        powers of ten every second, in float32 soon beyond the largest number. No flag of the run reports this.
         """
         count = self.value.shape[0]
         leaves = (self.value, *jax.tree.leaves(self.gradient))
@@ -42,20 +42,22 @@ class Gradients(NamedTuple):
 def gradients(
     objective: Objective, parameters: Any, starts: State, *, direction: Direction = "reverse", chunk: int = 64
 ) -> Gradients:
-    """Value and gradient of `objective(parameters, start)` at every start.
+    """Computes value and gradient of `objective(parameters, start)` at every initial state.
 
-    Compiled once for an objective: pass the same function again, not a new one that does the same. What a step costs
-    in memory is chosen where the objective calls `cpjax.measure`, by `checkpoint`; docs/gradients.md has measurements.
+    Compiled once per function object: pass the same objective again, not a new equivalent one. The memory per step is
+    set by `checkpoint` where the objective calls `cpjax.measure`; docs/gradients.md has measurements.
 
     Args:
+      objective: a function of the parameters and one initial state (scalars) that returns a scalar.
       parameters: a tree of floats or floating-point arrays.
-      starts: a State of arrays of shape (n,), any n.
+      starts: the initial states: a State of arrays of shape (n,), any n.
       direction: "reverse" costs a few rollouts whatever the number of parameters, and memory for each step; "forward"
         costs about one rollout for each parameter, and hardly any memory.
-      chunk: starts at a time, at most.
+      chunk: number of initial states computed together, at most.
 
     Raises:
-      InputError: another direction, a chunk below 1, or starts that `cpjax.sweep` would not take.
+      InputError: another direction, a chunk below 1, parameters that are not floating-point, initial states that hold
+        NaN or are not of one dtype and shape (n,), or an objective that returns no scalar.
     """
     if not isinstance(direction, str) or direction not in get_args(Direction):
         raise InputError("direction", direction, "reverse or forward")
@@ -84,7 +86,7 @@ def _gradients(parameters: Any, starts: State, *, objective: Objective, directio
 
     total = jax.tree.leaves(starts)[0].shape[0]
     count = math.ceil(total / chunk)
-    size = math.ceil(total / count)  # as even as can be
+    size = math.ceil(total / count)  # chunks of nearly equal size
     members = jnp.minimum(jnp.arange(count * size), total - 1).reshape(count, size)
     found = lax.map(lambda rows: jax.vmap(at)(jax.tree.map(lambda column: column[rows], starts)), members)
     return jax.tree.map(lambda x: x.reshape(count * size, *x.shape[2:])[:total], found)

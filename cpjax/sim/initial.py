@@ -1,4 +1,4 @@
-"""Checks of the initial state that a rollout is given."""
+"""Validation of the initial states of a rollout."""
 
 import functools
 from typing import Any
@@ -13,7 +13,7 @@ from cpjax.sim.plants import Plant
 
 
 def checked_initial(plant: Plant, start: Any, field: str, *, batched: bool) -> tuple[Any, Any, int | None]:
-    """Returns `start` with arrays of one dtype for numbers, that dtype, and how many initial states there are.
+    """Returns `start` as arrays of one dtype, that dtype, and the number of initial states (None if not `batched`).
 
     Raises:
       InputError: as `checked_tree` does.
@@ -25,13 +25,15 @@ def checked_initial(plant: Plant, start: Any, field: str, *, batched: bool) -> t
 def checked_tree(
     start: Any, limits: Any, units: dict[str, str], field: str, *, batched: bool
 ) -> tuple[Any, Any, int | None]:
-    """Returns a state with arrays of one dtype for numbers, that dtype, and its batch's length (None for one state).
+    """Returns a state as arrays of one dtype, that dtype, and the batch length (None if not `batched`).
 
     Python numbers take the dtype of the arrays beside them, or JAX's default float if there are none.
 
     Args:
-      limits: the largest magnitude of each component, of the structure that `start` has to have.
-      units: of components, by name, for error messages.
+      limits: the largest magnitude of each component, of the structure that `start` must have.
+      units: of the components by name, for error messages.
+      field: name of the argument in error messages.
+      batched: whether the components are arrays of one shape (n,), else scalars.
 
     Raises:
       InputError: another structure; a component that is not real, not finite, beyond its limit, of another dtype than

@@ -1,8 +1,7 @@
-"""Fixed-step integrators for second-order systems q'' = a(q, v), v = q'. They know no cart-pole.
+"""Fixed-step integrators for second-order systems q'' = a(q, v), v = q'; independent of the plant.
 
-Positions q and velocities v are pytrees of the same structure. Because q' = v is known, only accelerations are ever
-stored: substituting it into the classical methods removes half of their state without changing a digit of the result
-beyond rounding.
+Positions q and velocities v are pytrees of the same structure. Because q' = v is known, only accelerations are stored:
+substituting it into the classical methods removes half of their stage values and changes the result by rounding only.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,7 +16,7 @@ Acceleration: TypeAlias = Callable[[Tree, Tree], Tree]
 
 
 class Integrator(Protocol):
-    """One step: from (q, v) at t to (q, v) at t + dt. `first`, if given, is acceleration(q, v), known to the caller."""
+    """Interface of one step from (q, v) at t to (q, v) at t + dt; `first` is acceleration(q, v) if already known."""
 
     def __call__(
         self, acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar, first: Tree | None = None
@@ -25,7 +24,7 @@ class Integrator(Protocol):
 
 
 def euler(acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar, first: Tree | None = None) -> tuple[Tree, Tree]:
-    """Explicit Euler, order 1. Adds energy to an oscillation; here for comparison."""
+    """Advances by explicit Euler, order 1. Adds energy to an oscillation; for comparison only."""
     a1 = acceleration(q, v) if first is None else first
     return _add(q, (dt, v)), _add(v, (dt, a1))
 
@@ -33,14 +32,14 @@ def euler(acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar, first: Tree 
 def semi_implicit_euler(
     acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar, first: Tree | None = None
 ) -> tuple[Tree, Tree]:
-    """Semi-implicit (symplectic) Euler, order 1: positions advance with the new velocities."""
+    """Advances by semi-implicit (symplectic) Euler, order 1: positions advance with the new velocities."""
     a1 = acceleration(q, v) if first is None else first
     v = _add(v, (dt, a1))
     return _add(q, (dt, v)), v
 
 
 def rk4(acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar, first: Tree | None = None) -> tuple[Tree, Tree]:
-    """The classical Runge-Kutta method, order 4, with the rows of q' = v eliminated."""
+    """Advances by the classical Runge-Kutta method, order 4, with the rows of q' = v eliminated."""
     half = 0.5 * dt
     a1 = acceleration(q, v) if first is None else first
     a2 = acceleration(_add(q, (half, v)), _add(v, (half, a1)))
@@ -54,11 +53,11 @@ def rk4(acceleration: Acceleration, q: Tree, v: Tree, dt: Scalar, first: Tree | 
 
 
 INTEGRATORS: Mapping[str, Integrator] = {"rk4": rk4, "semi-implicit-euler": semi_implicit_euler, "euler": euler}
-"""By name, as `rollout` takes them."""
+"""Integrators by the name that `rollout` takes."""
 
 
 def _add(base: Tree, *terms: tuple[Scalar, Tree]) -> Tree:
-    """base + factor * tree + ..., leaf by leaf."""
+    """Returns base + factor * tree + ..., leaf by leaf."""
     for factor, tree in terms:
         base = jax.tree.map(lambda b, t, factor=factor: b + factor * t, base, tree)
     return base

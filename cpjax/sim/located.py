@@ -1,9 +1,9 @@
 """The closed loop with its events located inside the steps: see `switching.py`.
 
-Each iteration is one step of the automaton there. On the continuous clock the events are the controller's changes of
-mode, the plant's own events, and the moments at which the voltage reaches the limit or leaves it: there the vector
-field has a kink, over which a Runge-Kutta step loses its order, and its derivatives with it. On the sampled clock the
-input is held between control instants, so that only the plant's own events are left.
+Each iteration is one step of the state machine there. On the continuous clock the events are the controller's changes
+of mode, the plant's own events, and the instants at which the voltage reaches or leaves its limit: there the vector
+field has a kink, across which a Runge-Kutta step and its derivatives lose their order. On the sampled clock the input
+is held between control instants, so that only the plant's own events remain.
 """
 
 import functools
@@ -31,24 +31,24 @@ from cpjax.sim.switching import LANDED, RUN, Motion, iterate, observe, pick, sta
 
 
 class _Loop(NamedTuple):
-    """The scan's carry."""
+    """Carry of the scan."""
 
     motion: Motion
     flag: jax.Array
     voltage: jax.Array
-    """At the sample before [V]."""
+    """Voltage at the previous sample [V]."""
     mode: jax.Array
-    """At the sample before."""
+    """Mode at the previous sample."""
     control: Control | None
-    """On the sampled clock."""
+    """Controller on the sampled clock, else None."""
     changes: jax.Array
-    """Control instants in a row at which the mode changed, on the sampled clock."""
+    """Number of consecutive control instants at which the mode changed, on the sampled clock."""
 
 
 def simulate(
     start: Tree, plant: Plant, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
 ) -> tuple[jax.Array | None, Sample, Any]:
-    """Simulates one start; see `cpjax.sim.rollout.simulate`."""
+    """Simulates one initial state; see `cpjax.sim.rollout.simulate`."""
     q, v = plants.coordinates(plant, start)
     flag = nonfinite_flag((start, plant, controller))
     system: System
@@ -78,7 +78,7 @@ def simulate(
     samples = None
     if kept is not None:
         samples, passed = kept
-        # The first iteration after which so many grid points have been passed.
+        # The first iteration after which the wanted number of grid points has been passed.
         wanted = jnp.arange(settings.save_every, settings.steps, settings.save_every, dtype=passed.dtype)
         rows = jnp.searchsorted(passed, wanted)
         samples = jnp.concatenate([pack(first)[None], samples[rows]])
@@ -88,8 +88,8 @@ def simulate(
 def _run(
     carry: tuple[_Loop, Any], plant: Plant, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
 ) -> tuple[tuple[_Loop, Any], tuple[jax.Array, jax.Array] | None]:
-    """Returns loop and metric after all iterations; and, of each, its sample, packed, and how many grid points it has
-    passed, if samples are kept."""
+    """Returns loop and metric state after all iterations and, if samples are saved, the packed sample of each iteration
+    with the number of grid points passed."""
     iterations = settings.steps + settings.spare_steps
 
     def body(
@@ -115,7 +115,7 @@ def _law(motion: Motion, control: Control | None) -> jax.Array:
 
 
 def _sample(plant: Plant, loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
-    """Returns the sample at the last point that was reached; `before` is the motion an iteration earlier."""
+    """Returns the sample at the last point that was reached; `before` is the motion one iteration earlier."""
     motion = loop.motion
     held = isinstance(motion.mode, HeldMode)
     landed = (before.stage == LANDED) & ~failures.is_stopped(loop.flag)
@@ -140,8 +140,8 @@ def _sample(plant: Plant, loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
 def _advance(
     plant: Plant, controller: Any, loop: _Loop, dt: jax.Array, settings: Settings, left: jax.Array
 ) -> tuple[_Loop, jax.Array]:
-    """Makes one iteration. A run that goes wrong, or does not end in the iterations that are left, is held at the last
-    point and flagged (see `failures.py`); its samples go on."""
+    """Performs one iteration. A run that fails, or cannot end within the iterations that are left, is held at the last
+    point and flagged (see `failures.py`); its samples continue."""
     integrator: Integrator = INTEGRATORS[settings.integrator]
     held = settings.clock == "sampled"
     system: System = HeldLoop(plant) if held else ContinuousLoop(plant, controller)
@@ -155,7 +155,7 @@ def _advance(
     reason = jnp.where(going & within, np.int32(Flag.OVERFLOW), lost)
     chatter = jnp.where(good & (after.crossings >= CHATTER_LENGTH), np.int32(Flag.CHATTERING), np.int32(0))
     flag = loop.flag | jnp.where(stopped | ended | good, np.int32(0), reason) | chatter
-    # A run that is held passes one grid point an iteration.
+    # A held run passes one grid point per iteration.
     on_hold = motion._replace(
         passed=motion.passed + (~ended).astype(motion.passed.dtype),
         offset=jnp.zeros_like(motion.offset),
@@ -174,7 +174,7 @@ def _advance(
 def _control(
     plant: Plant, controller: Any, system: System, loop: _Loop, instant: jax.Array, settings: Settings
 ) -> _Loop:
-    """Reads the controller on the sampled clock, if this is a control instant."""
+    """Updates the controller on the sampled clock, if this is a control instant."""
     motion = loop.motion
     assert loop.control is not None
     state = plants.state_of(plant, motion.q, motion.v)

@@ -1,8 +1,8 @@
-"""What a rollout is judged by, computed while it runs.
+"""Metrics of a rollout, computed while it runs.
 
-A metric is a fold over the rollout's samples: `init` with the first sample, `update` with each sample (the first one
-included, at `elapsed = 0`), `finish` with the last. Nothing of the trajectory needs to be stored for it, so a million
-starts fit in memory.
+A metric is a streaming reduction over the rollout's samples: `init` with the first sample, `update` with each sample
+(the first one included, at `elapsed = 0`), `finish` with the last. The trajectory need not be stored for it, so a
+million initial states fit in memory.
 """
 
 import math
@@ -23,64 +23,64 @@ class Sample(NamedTuple):
     """The closed loop at one instant."""
 
     time: jax.Array
-    """[s]."""
+    """Time since the start of the rollout [s]."""
     elapsed: jax.Array
-    """Since the sample before [s]; 0 at the first, and after a flag has stopped the run."""
+    """Time since the previous sample [s]; 0 at the first, and after a flag has stopped the run."""
     state: Any
-    """The plant's state."""
+    """State of the plant."""
     voltage: jax.Array
-    """The input applied from now on, clipped [V]."""
+    """Input applied from this sample on, clipped [V]."""
     voltage_since: jax.Array
-    """Applied right after the sample before [V]; at the first sample `voltage`."""
+    """Input applied right after the previous sample [V]; at the first sample equal to `voltage`."""
     voltage_until: jax.Array | None
-    """Applied right before this sample [V]: the law of the mode until now at this state. None on the sampled clock: a
-    held voltage is still what it was."""
+    """Input applied right before this sample [V]: the law of the mode until now at this state. None on the sampled
+    clock, where a held voltage has not changed since the previous sample."""
     mode: jax.Array
-    """From now on."""
+    """Mode from this sample on."""
     mode_before: jax.Array
-    """Until now, since the sample before."""
+    """Mode from the previous sample until this one."""
     outputs: dict[str, jax.Array]
-    """What the plant wants kept beside state and input, from now on; of a `CartPole`, `cart_acceleration` [m/s^2]."""
+    """Further outputs of the plant from this sample on, by name; for a `CartPole`, `cart_acceleration` [m/s^2]."""
     plant_mode: Any
-    """The plant's own mode from now on; () for a plant without modes."""
+    """The plant's own mode from this sample on; () for a plant without modes."""
     flag: jax.Array
     """Bits of `Flag`."""
     crossing: jax.Array
-    """What was located here, int32: 0 nothing, 1 and 2 the upper and the lower end of the supply, 3 the gate; events of
-    the plant's own from 4 on."""
+    """Event located at this sample, int32: 0 none, 1 and 2 the upper and the lower voltage limit, 3 the gate; from 4 on
+    the plant's own events."""
     crossing_speed: jax.Array
-    """How fast that guard fell [1/s]: of the voltage relative to the limit, or of the gate's margin. 0 elsewhere."""
+    """Rate at which that guard (relative voltage, gate margin, plant's guard) fell [its unit/s]; 0 without an event."""
 
     @property
     def voltage_before(self) -> jax.Array:
-        """Applied right before this sample [V], on either clock."""
+        """Input applied right before this sample [V], on either clock."""
         return self.voltage_since if self.voltage_until is None else self.voltage_until
 
     @property
     def cart_acceleration(self) -> jax.Array:
-        """x'' of a cart-pole from now on [m/s^2]."""
+        """x'' of a cart-pole from this sample on [m/s^2]."""
         return self.outputs["cart_acceleration"]
 
 
 class Fold(Protocol):
-    """A metric as a fold over samples. A pytree: its numbers may be traced."""
+    """Interface of a metric, a streaming reduction over samples. A pytree: its numbers may be traced."""
 
     def init(self, sample: Sample) -> Any:
-        """The memory before the first update."""
+        """Returns the metric state before the first update: any pytree of arrays."""
         ...
 
     def update(self, memory: Any, sample: Sample) -> Any:
-        """The memory after `sample`."""
+        """Returns the metric state after `sample`, of the same structure, shapes and dtypes."""
         ...
 
     def finish(self, memory: Any, last: Sample) -> Any:
-        """The result."""
+        """Returns the result from the final metric state and the last sample."""
         ...
 
 
 @pytree
 class NoMetrics:
-    """The metric that keeps nothing; its result is None."""
+    """Empty metric; its result is None."""
 
     def init(self, sample: Sample) -> tuple[()]:
         return ()
@@ -94,10 +94,10 @@ class NoMetrics:
 
 @pytree
 class Metrics:
-    """The evaluation protocol's numbers for one rollout; after a sweep, an array of each.
+    """Metrics of the evaluation protocol for one rollout; after a sweep, arrays of shape (n,).
 
     Attributes:
-      success: settled, `hold` before the end at the latest, within the track, and not stopped by a flag.
+      success: settled at least `hold` before the end, |x| never beyond `track_limit`, and not stopped by a flag.
       settling_time: first time from which |theta| (wrapped) and |x - reference_x| stay in their bands to the end [s];
         inf if never.
       cart_travel: max |x| [m].
@@ -122,11 +122,11 @@ class Metrics:
 
 @pytree
 class TimeOutside:
-    """The fold that yields a smooth and bounded stand-in for the settling time [s].
+    """Metric whose result is a smooth, bounded surrogate of the settling time [s].
 
-    The integral of 1 - exp(-(1 - cos theta) / angle_width^2 - ((x - reference_x) / position_width)^2 / 2): the time
-    spent farther from upright in place than the widths, roughly. By the trapezoidal rule. The cosine makes it smooth at
-    theta = pi too, where theta modulo a turn, and what a sum over samples makes of it, has a kink.
+    The integral of 1 - exp(-(1 - cos theta) / angle_width^2 - ((x - reference_x) / position_width)^2 / 2) by the
+    trapezoidal rule: roughly the time spent farther than the widths from upright at `reference_x`. The cosine makes it
+    smooth also at theta = pi, where theta modulo a turn, and a sum over samples of it, has a kink.
     """
 
     angle_width: Scalar = number("rad", "of the target", default=0.2, above=0.0)
@@ -162,7 +162,7 @@ class _Memory(NamedTuple):
 
 @pytree
 class ProtocolMetrics:
-    """The fold that yields `Metrics`. Hard: settling time and success are piecewise constant in every parameter."""
+    """Metric whose result is `Metrics`. Not smooth: settling time and success are piecewise constant in parameters."""
 
     angle_band: Scalar = number("rad", "settled: |theta| within", default=0.05, above=0.0)
     position_band: Scalar = number("m", "settled: |x - reference_x| within", default=0.05, above=0.0)
@@ -188,7 +188,7 @@ class ProtocolMetrics:
         inside = (jnp.abs(wrap_angle(sample.state.theta)) <= self.angle_band) & (away <= self.position_band)
         first, last = sample.voltage_since, sample.voltage_until
         variation = jnp.abs(sample.voltage - sample.voltage_before)
-        # The factors stand so that 0 s of a huge voltage is 0 and not 0 times infinity.
+        # The factors are ordered so that 0 s of a huge voltage gives 0 and not 0 times infinity.
         effort = sample.elapsed * first * first
         if last is not None:
             variation = variation + jnp.abs(last - first)

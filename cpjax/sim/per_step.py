@@ -1,7 +1,7 @@
-"""The closed loop in equal steps: the controller is read at control instants, and its command is held in between.
+"""The closed loop in equal steps: the controller is updated at control instants, and its command is held in between.
 
-At each step `_observe` reads the controller and takes a sample, `_advance` integrates to the next. On the continuous
-clock every step is a control instant for the mode, and the law of the mode is evaluated in every stage.
+At each step `_observe` updates the controller and takes a sample, and `_advance` integrates to the next. On the
+continuous clock every step is a control instant for the mode, and the law of the mode is evaluated in every stage.
 """
 
 import functools
@@ -31,26 +31,26 @@ from cpjax.sim.stepper import applied_voltage, step_continuous, step_held, step_
 
 
 class _Instant(NamedTuple):
-    """What `_observe` computed and `_advance` needs again."""
+    """Results of `_observe` that `_advance` reuses."""
 
     accelerations: Tree
     geometry: Tree
 
 
 class _Loop(NamedTuple):
-    """The scan's carry."""
+    """Carry of the scan."""
 
     state: Tree
     control: Control
     flag: jax.Array
     changes: jax.Array
-    """Control instants in a row at which the mode changed."""
+    """Number of consecutive control instants at which the mode changed."""
 
 
 def simulate(
     start: Tree, plant: Plant, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
 ) -> tuple[jax.Array | None, Sample, Any]:
-    """Simulates one start; see `cpjax.sim.rollout.simulate`."""
+    """Simulates one initial state; see `cpjax.sim.rollout.simulate`."""
     control = start_control(plant, controller, start, settings)
     flag = nonfinite_flag((start, plant, controller))
     flag = jnp.where(flag != 0, np.int32(NEEDS_RECOMPUTE), flag) if settings.fast_path else flag
@@ -71,7 +71,7 @@ def simulate(
 def _run(
     carry: tuple[_Loop, Any], plant: Plant, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
 ) -> tuple[tuple[_Loop, Any], jax.Array | None]:
-    """Returns loop and metric after all steps, and the samples that are kept but for the last."""
+    """Returns loop and metric state after all steps, and the saved samples except the last."""
     steps, every = settings.steps, settings.save_every
 
     def body(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], jax.Array | None]:
@@ -89,7 +89,7 @@ def _run(
         return carry, pack(_saved(plant, sample, loop))
 
     if every is None:
-        # With these options of the compiler, all that is remembered would be copied at each step.
+        # With these compiler options, all that is stored for reverse mode would be copied at each step.
         checkpoint = "segments" if runtime.compiler_fuses_loops() else settings.checkpoint
         return scan(body, carry, jnp.arange(steps), checkpoint)
     if every == 1:
@@ -108,12 +108,12 @@ def _fold(
     settings: Settings,
     update: Callable[..., Any],
 ) -> Any:
-    """Returns the metric's memory after a sample, with the derivative of the mean if that is asked for."""
+    """Returns the metric state after a sample, with the derivative of the mean if that is requested."""
     new = update(fold, memory, sample)
     if now.blend is None or before.blend is None or not sees_the_voltage(fold, memory, sample):
         return new
-    # A metric need not be linear in the voltage. So it is computed with the other voltage too: with that of the period
-    # before, which is still applied unless this is a control instant, and with that of the period that begins.
+    # A metric need not be linear in the voltage, so it is also computed with the other voltage: with that of the
+    # previous period, still applied unless this is a control instant, and with that of the period that begins.
     instant = index % settings.steps_per_control == 0 if settings.steps_per_control > 1 else np.bool_(True)
     since = sample._replace(
         voltage_since=before.blend.held,
@@ -127,7 +127,7 @@ def _fold(
 
 
 def sees_the_voltage(fold: Fold, memory: Any, sample: Sample) -> bool:
-    """Whether a metric's update may depend on the voltage or the mode, or on what the plant keeps because of it."""
+    """Returns whether a metric's update may depend on the voltage or the mode, also through the plant's outputs."""
 
     def update(voltages: Any) -> Any:
         names = ("voltage", "voltage_since", "outputs", "mode", "mode_before")
@@ -143,33 +143,33 @@ def sees_the_voltage(fold: Fold, memory: Any, sample: Sample) -> bool:
 
 
 def _completed(plant: Plant, sample: Sample) -> Sample:
-    """Returns a sample whose voltage has been replaced, with what follows from it."""
+    """Returns a sample whose voltage has been replaced, with its outputs recomputed."""
     q, v = plants.coordinates(plant, sample.state)
     acceleration = plants.accelerations(plant, plants.geometry(plant, q), v, sample.voltage)
     return sample._replace(outputs=plants.outputs(plant, sample.state, acceleration, sample.voltage))
 
 
 def _saved(plant: Plant, sample: Sample, loop: _Loop) -> Sample:
-    """Returns a sample as it is saved: its voltage has the derivative that the plant sees."""
+    """Returns a sample as it is saved: with the derivative of the voltage that the plant receives."""
     return sample if loop.control.blend is None else _completed(plant, sample._replace(voltage=loop.control.applied))
 
 
 def update_metric(fold: Fold, memory: Any, sample: Sample) -> Any:
-    """Returns a metric's memory after a sample."""
+    """Returns a metric's state after a sample."""
     updated = cast(call("metrics", fold, "update", memory, sample), sample.time.dtype)
     return like("metrics.update", updated, memory)
 
 
 def start_metric(fold: Fold, first: Sample) -> Any:
-    """Returns a metric's memory before its first update, in the rollout's dtype."""
+    """Returns a metric's state before its first update, in the rollout's dtype."""
     return jax.tree.map(jnp.asarray, cast(call("metrics", fold, "init", first), first.time.dtype))
 
 
 def _observe(
     plant: Plant, controller: Any, loop: _Loop, index: jax.Array, dt: jax.Array, settings: Settings
 ) -> tuple[_Loop, Sample, _Instant]:
-    """Reads the controller at step `index`, if that is a control instant, takes a sample, and hands the accelerations
-    at this instant on to `_advance`, whose first stage they are."""
+    """Updates the controller at step `index`, if that is a control instant, takes a sample, and returns the
+    accelerations at this instant, which are the first stage of `_advance`."""
     state = loop.state
     control = update_control(plant, controller, loop.control, state, settings)
     before = loop.control.mode
@@ -181,7 +181,7 @@ def _observe(
         control, changes = jax.tree.map(lambda x, y: jnp.where(instant, x, y), new, old)
     voltage, mode = control.voltage, control.mode
     flag = loop.flag | jnp.where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
-    # Optimistic, no run is stopped: one that should be is in doubt.
+    # The fast path never stops a run; it marks it for recomputation.
     going = jnp.asarray(True) if settings.fast_path else ~failures.is_stopped(flag)
     q, v = plants.coordinates(plant, state)
     geometry = plants.geometry(plant, q)
@@ -207,11 +207,11 @@ def _observe(
 
 
 def _advance(plant: Plant, controller: Any, loop: _Loop, instant: _Instant, dt: jax.Array, settings: Settings) -> _Loop:
-    """Integrates one step; a run that goes wrong is held and flagged: see `failures.py`."""
+    """Integrates one step; a failed run is held and flagged: see `failures.py`."""
     state, method = loop.state, INTEGRATORS[settings.integrator]
     first, geometry = instant
     outlook = failures.look_ahead(plant, plants.coordinates(plant, state)[1], first, dt)
-    if settings.fast_path:  # values only, so nothing has to be safe, and what went wrong is computed again
+    if settings.fast_path:  # values only: no guarded derivatives, and failed runs are recomputed
         after, near = step_held_incremental(plant, method, state, geometry, loop.control.voltage, dt, first)
         right = outlook.possible & near & plants.within(after, plant.limits)
         return loop._replace(state=after, flag=loop.flag | jnp.where(right, np.int32(0), np.int32(NEEDS_RECOMPUTE)))

@@ -1,7 +1,7 @@
-"""What the loop asks of a plant, and the few things it does with one. Independent of any particular plant.
+"""Interface of a plant in the loop, and checked calls of its methods. Independent of any particular plant.
 
-A plant is a second-order system q'' = a(q, v, u) with one input u, the positions q and velocities v being two pytrees
-of the same structure. Its state may be any pytree of scalars.
+A plant is a second-order system q'' = a(q, v, u) with one input u; positions q and velocities v are two pytrees of the
+same structure. Its state may be any pytree of scalars.
 """
 
 from typing import Any, Protocol, TypeAlias, runtime_checkable
@@ -21,13 +21,13 @@ Tree: TypeAlias = Any
 class Plant(Protocol):
     """A second-order system with one input. A pytree: its numbers may be traced.
 
-    Positions, velocities and accelerations at zero state and zero input have to be finite: a run that has gone wrong is
-    continued from there, and its result dropped.
+    Positions, velocities and accelerations at zero state and zero input must be finite: a failed run is continued from
+    there, and its result discarded.
     """
 
     @property
     def limits(self) -> Tree:
-        """The largest magnitude of each component of the state, as a state; a run that goes beyond is stopped."""
+        """Largest allowed magnitude of each component, as a state; a run that exceeds one is stopped."""
         ...
 
     def coordinates(self, state: Tree) -> tuple[Tree, Tree]:
@@ -39,7 +39,7 @@ class Plant(Protocol):
         ...
 
     def saturate(self, command: Scalar) -> Scalar:
-        """Returns the input that the drive makes of a command."""
+        """Returns the input that the drive applies for a command."""
         ...
 
     def accelerations(self, geometry: Tree, v: Tree, u: Scalar) -> Tree:
@@ -53,17 +53,17 @@ class Plant(Protocol):
 
 @runtime_checkable
 class Geometric(Protocol):
-    """A plant whose accelerations see its positions through functions that are worth sharing, such as sine and
-    cosine."""
+    """A plant whose accelerations depend on its positions only through functions that are worth sharing, such as sine
+    and cosine."""
 
     def geometry(self, q: Tree) -> Tree:
-        """Returns what `accelerations` needs of the positions."""
+        """Returns the functions of the positions that `accelerations` uses."""
         ...
 
     def geometry_near(self, geometry: Tree, change: Tree) -> tuple[Tree, jax.Array]:
         """Returns the geometry at q + `change`, given that at q, and whether it is accurate to rounding.
 
-        It has to cost less than `geometry`, and may be inaccurate for large changes. `sweep` uses it for values.
+        It must cost less than `geometry`, and may be inaccurate for large changes. `sweep` uses it for values only.
         """
         ...
 
@@ -73,7 +73,7 @@ class Eventful(Protocol):
     """A plant with modes of its own, such as stick and slip, or the ends of a track.
 
     Its `accelerations` take the mode as a fourth argument. A mode ends where a guard, a smooth function, falls below
-    zero; that moment is located inside the integrator's step.
+    zero; that instant is located inside the integrator's step.
     """
 
     def start_mode(self, q: Tree, v: Tree) -> Tree:
@@ -81,7 +81,7 @@ class Eventful(Protocol):
         ...
 
     def guards(self, q: Tree, v: Tree, u: Scalar, mode: Tree) -> tuple[Scalar, ...]:
-        """Returns numbers that are at least 0 while the mode lasts; always as many, smooth in q, v and u."""
+        """Returns scalars that are at least 0 while the mode lasts; a fixed number of them, smooth in q, v and u."""
         ...
 
     def jump(self, q: Tree, v: Tree, mode: Tree, guard: jax.Array) -> tuple[Tree, Tree, Tree]:
@@ -90,15 +90,15 @@ class Eventful(Protocol):
 
 
 def has_events(plant: Any) -> bool:
-    """Whether a plant is `Eventful`. (Python takes longer for `isinstance` and a protocol than for all of a check.)"""
+    """Returns whether a plant is `Eventful`. (`isinstance` with a protocol would take longer than a whole check.)"""
     return all(hasattr(plant, name) for name in ("start_mode", "guards", "jump"))
 
 
 def check_plant(plant: Any) -> None:
-    """Checks that a plant has all that the loop asks for.
+    """Checks that a plant has all attributes that the loop uses.
 
     Raises:
-      InputError: a method is missing, also of those that belong together.
+      InputError: a required attribute is missing, or only some of the methods that belong together are present.
     """
     needed = ("limits", "coordinates", "state", "saturate", "accelerations")
     missing = [name for name in needed if not hasattr(plant, name)]
@@ -115,7 +115,11 @@ def coordinates(plant: Plant, state: Tree) -> tuple[Tree, Tree]:
 
 
 def state_of(plant: Plant, q: Tree, v: Tree) -> Tree:
-    """Returns the state of (q, v)."""
+    """Returns the state of (q, v).
+
+    Raises:
+      InputError: the state's structure is not that of `plant.limits`.
+    """
     state = call("plant", plant, "state", q, v)
     found: Any = jax.tree.structure(state)
     if found != jax.tree.structure(plant.limits):
@@ -124,23 +128,23 @@ def state_of(plant: Plant, q: Tree, v: Tree) -> Tree:
 
 
 def geometry(plant: Plant, q: Tree) -> Tree:
-    """Returns what `accelerations` needs of the positions."""
+    """Returns the functions of the positions that `accelerations` uses."""
     return plant.geometry(q) if isinstance(plant, Geometric) else q
 
 
 def geometry_near(plant: Plant, at: Tree, q: Tree, change: Tree) -> tuple[Tree, jax.Array]:
-    """Returns the geometry at q, which is `change` away from where it was `at`, and whether it is accurate."""
+    """Returns the geometry at q, given the geometry `at` the positions q - `change`, and whether it is accurate."""
     return plant.geometry_near(at, change) if isinstance(plant, Geometric) else (q, jnp.asarray(True))
 
 
 def accelerations(plant: Plant, geometry: Tree, v: Tree, u: Scalar, mode: Tree = ()) -> Tree:
-    """Returns q'' under the input u, in a plant's own mode if it has modes."""
+    """Returns q'' under the input u, in the plant's own mode if it has modes."""
     arguments = (geometry, v, u, mode) if has_events(plant) else (geometry, v, u)
     return like("plant.accelerations", call("plant", plant, "accelerations", *arguments), v)
 
 
 def saturate(plant: Plant, command: jax.Array) -> jax.Array:
-    """Returns the input that the drive makes of a command, in the command's dtype."""
+    """Returns the input that the drive applies for a command, in the command's dtype."""
     return real("plant.saturate", call("plant", plant, "saturate", command), command.dtype)
 
 
@@ -150,7 +154,11 @@ def start_mode(plant: Plant, q: Tree, v: Tree) -> Tree:
 
 
 def outputs(plant: Plant, state: Tree, acceleration: Tree, u: Scalar) -> dict[str, Any]:
-    """Returns what the plant wants kept of a sample beside state and input, by name; nothing by default."""
+    """Returns the scalars that the plant saves beside state and input, by name; none by default.
+
+    Raises:
+      InputError: the plant's `outputs` returns no dict, or a name of a trajectory's own columns.
+    """
     if not hasattr(plant, "outputs"):
         return {}
     found = call("plant", plant, "outputs", state, acceleration, u)
@@ -162,10 +170,10 @@ def outputs(plant: Plant, state: Tree, acceleration: Tree, u: Scalar) -> dict[st
 
 
 _TAKEN = frozenset({"time", "state", "voltage", "mode", "flag", "metrics", "outputs"})
-"""Names of a trajectory's own columns."""
+"""Names of a trajectory's own columns, which outputs must not have."""
 
 
 def within(tree: Tree, limits: Tree) -> jax.Array:
-    """Whether no number of the tree is larger in magnitude than its limit, or NaN."""
+    """Returns whether every number of the tree is at most its limit in magnitude; False for NaN."""
     inside = jax.tree.map(lambda value, limit: jnp.abs(value) <= limit, tree, limits)
     return jax.tree.reduce(jnp.logical_and, inside)

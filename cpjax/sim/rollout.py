@@ -1,7 +1,7 @@
 """Closed-loop rollouts: from a plant, a controller and an initial state to a trajectory and its metrics.
 
-Everything here is for one initial state; batches are `jax.vmap` of it (`cpjax.sweep` does so). The work is done by one
-compiled scan: that of `per_step.py`, or that of `located.py`.
+Everything here is for one initial state; batches are `jax.vmap` of it, as in `cpjax.sweep`. One compiled scan does the
+computation: that of `per_step.py` or that of `located.py`.
 """
 
 import copy
@@ -43,10 +43,10 @@ class Trajectory:
       state: the plant's state, of (n,) arrays; of a `CartPole` a `State`, whose theta is not wrapped.
       voltage: (n,) applied from that instant on, clipped [V].
       mode: (n,) int32, of the controller, from that instant on.
-      outputs: what the plant keeps beside these, by name, each (n,); of a `CartPole` `cart_acceleration`, x'' from that
+      outputs: further outputs of the plant by name, each (n,); of a `CartPole` `cart_acceleration`, x'' from that
         instant on [m/s^2].
       flag: () int32, bits of `Flag` for the whole run; 0 is clean.
-      metrics: what the run's metric returned, over every step whether saved or not.
+      metrics: result of the metric, over every step whether saved or not.
     """
 
     time: jax.Array
@@ -79,14 +79,17 @@ def rollout(
     Args:
       plant: a `CartPole`, or a plant of your own (see `cpjax.sim.plants.Plant`).
       controller: a `Hybrid`, a law, or a controller with memory (see `cpjax.controllers.protocol`).
-      start: the initial state, of scalars. For many, `cpjax.sweep` or `jax.vmap`.
-      metrics: a metric, folded over all steps; by default `ProtocolMetrics()` for a `CartPole`, none for other plants.
+      start: the initial state, of scalars. For many, use `cpjax.sweep` or `jax.vmap`.
+      metrics: a metric, updated at every step; by default `ProtocolMetrics()` for a `CartPole`, none for other plants.
       simulation: see `cpjax.Simulation`: duration, dt, clock, control_period, switching, integrator, save_every,
         spare_steps, checkpoint, derivative.
 
+    Returns:
+      The trajectory, of steps / save_every + 1 samples.
+
     Raises:
-      InputError: bad arguments, named; a law, controller, plant or metric that returns what it should not; never
-        because of what the simulation does (see `Trajectory.flag`).
+      InputError: an invalid argument, which is named, or an invalid return value of a law, controller, plant or metric.
+        Failures of the simulation itself do not raise (see `Trajectory.flag`).
     """
     check_names("rollout", simulation)
     save_every = simulation.pop("save_every", 1)
@@ -105,7 +108,11 @@ def measure(
     metrics: Fold | None = None,
     **simulation: Unpack[Simulation],
 ) -> Any:
-    """Returns what `rollout(...).metrics` would be, without storing a trajectory. Arguments and errors as there."""
+    """Simulates as `rollout` does and returns only the metric's result, without storing a trajectory.
+
+    Arguments and errors are those of `rollout`, except that there is no `save_every` and that other plants than a
+    `CartPole` need `metrics`.
+    """
     check_names("measure", simulation)
     if "save_every" in simulation:
         raise TypeError("measure() saves no trajectory and takes no save_every; cpjax.rollout does")
@@ -116,14 +123,14 @@ def measure(
 def prepared(
     plant: Any, controller: Any, start: Any, metrics: Fold | None, *, batched: bool = False, **simulation: Any
 ) -> tuple[Any, tuple[Plant, Any, Fold, Any], Settings, list[bool]]:
-    """Returns the arguments of `simulate`, checked and cast to the initial state's dtype.
+    """Checks the arguments of `simulate` and casts them to the initial state's dtype.
 
     Args:
       batched: whether `start` holds many initial states, arrays of shape (n,).
 
     Returns:
-      The initial state; plant, controller, metric and dt; the settings; and, for each leaf of these, whether it has an
-      axis of one entry for each initial state.
+      The initial state; plant, controller, metric and dt; the settings; and, for each leaf of plant, controller, metric
+      and dt, whether it has a leading axis of one entry per initial state.
 
     Raises:
       InputError: as `rollout` does.
@@ -158,7 +165,7 @@ def prepared(
 
 
 def default_metrics(plant: Any) -> Fold:
-    """Returns the metric of a rollout that is given none: the protocol's for a `CartPole`, nothing for other plants."""
+    """Returns the default metric of a rollout: `ProtocolMetrics()` for a `CartPole`, `NoMetrics()` for other plants."""
     return ProtocolMetrics() if isinstance(plant, CartPole) else NoMetrics()
 
 
@@ -173,8 +180,8 @@ def simulate(
     """Simulates one initial state; arguments as `prepared` returns them.
 
     Returns:
-      The saved samples but for the last (None if nothing is saved), the last one (its flag may have IN_DOUBT), and the
-      metric's result.
+      The saved samples except the final one (None if nothing is saved), the final sample (its flag may have
+      NEEDS_RECOMPUTE), and the metric's result.
     """
     plant, controller, fold = reveal((plant, controller, fold))
     if settings.clock == "sampled":
@@ -188,20 +195,20 @@ def simulate(
 
 
 def results(kept: SavedSamples | None, last: Sample, result: Any) -> Any:
-    """Returns what users get of what `simulate` returned: a `Trajectory`, or only the metric's result."""
+    """Returns the user's result from that of `simulate`: a `Trajectory`, or only the metric's result."""
     if kept is None:
         return result
     return Trajectory(**fields(kept, last), flag=last.flag & ~NEEDS_RECOMPUTE, metrics=result)
 
 
 def _without_designs(controller: Any) -> Any:
-    """A regulator's design is no part of its law: gains with one and gains without share a compilation."""
+    """Returns the controller without its regulators' designs: gains with and without one share a compilation."""
 
     def bare(law: Any) -> Any:
         designed = isinstance(law, StateFeedback) and law.design is not None
         if not designed:
             return law
-        law = copy.copy(law)  # which has been checked
+        law = copy.copy(law)  # not `replace`, whose checks the law has already passed
         object.__setattr__(law, "design", None)
         return law
 

@@ -1,8 +1,8 @@
-"""What a trajectory keeps of the samples, in a form that XLA writes fast.
+"""Saved samples of a trajectory, in a form that XLA writes fast.
 
-Of what a loop stacks, XLA writes a single array in place, but several of a kind it merges and then copies them whole at
-every write. And what is computed for the array's sake alone is computed number by number, so what the plant wants kept
-beside state and input, which follows from the rest, is left for afterwards.
+XLA writes a single array stacked by a loop in place, but merges several of the same shape and dtype and copies them
+whole at every write; each sample is therefore packed into one row. Values computed only for the stacked array are not
+vectorised, so the plant's outputs, which follow from the other fields, are computed after the loop.
 """
 
 from typing import Any, NamedTuple
@@ -16,12 +16,12 @@ from cpjax.sim.plants import Plant
 
 
 class SavedSamples(NamedTuple):
-    """Of every row but the last one."""
+    """Saved samples except the final one."""
 
     packed: jax.Array
-    """Shape (rows, columns), of `pack`."""
+    """Rows of `pack`, shape (rows, columns)."""
     outputs: dict[str, jax.Array]
-    """Each of shape (rows,)."""
+    """Outputs of the plant by name, each of shape (rows,)."""
 
 
 def pack(sample: Sample) -> jax.Array:
@@ -30,7 +30,7 @@ def pack(sample: Sample) -> jax.Array:
 
 
 def keep(packed: jax.Array, plant: Plant, last: Sample) -> SavedSamples:
-    """Returns rows of shape (rows, columns), completed; `last` is a sample of the same run."""
+    """Returns packed rows (rows, columns) with the plant's outputs added; `last` is a sample of the same run."""
     fields = _unpacked([packed[:, i] for i in range(packed.shape[1])], last)
 
     def row(fields: _PackedFields) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def keep(packed: jax.Array, plant: Plant, last: Sample) -> SavedSamples:
 
 
 def fields(kept: SavedSamples, last: Sample) -> dict[str, Any]:
-    """Returns the fields of a `Trajectory`, of shape (..., rows + 1), of all rows (row first) and the last sample."""
+    """Returns the fields of a `Trajectory`, shape (..., rows + 1), from all rows (row axis first) and `last`."""
 
     def joined(many: jax.Array, one: jax.Array) -> jax.Array:
         return jnp.concatenate([jnp.moveaxis(many, 0, -1).astype(one.dtype), one[..., None]], axis=-1)

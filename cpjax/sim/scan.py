@@ -1,4 +1,4 @@
-"""A scan whose reverse mode remembers little."""
+"""Scan with checkpointing, which bounds the memory of reverse mode."""
 
 import math
 from collections.abc import Callable
@@ -12,12 +12,12 @@ from cpjax.sim.settings import Checkpoint
 
 
 def scan(body: Callable[[Any, Any], Any], carry: Any, xs: jax.Array, checkpoint: Checkpoint) -> Any:
-    """`lax.scan(body, carry, xs)`, whose reverse mode computes again what it needs from carries that it kept.
+    """Computes `lax.scan(body, carry, xs)`, whose reverse mode recomputes intermediate values from stored carries.
 
     Args:
-      checkpoint: which carries. "segments": one in about sqrt(n), from which those in between are computed once more:
-        memory grows with sqrt(n), and each step is computed three times. "every_step": each, so that each step is
-        computed twice.
+      checkpoint: which carries are stored. "segments": one in about sqrt(n), from which those in between are
+        recomputed: memory grows with sqrt(n), and each step is computed three times. "every_step": all of them, so that
+        each step is computed twice.
     """
     body = jax.checkpoint(body, prevent_cse=False)
     if checkpoint == "every_step":
@@ -34,6 +34,6 @@ def scan(body: Callable[[Any, Any], Any], carry: Any, xs: jax.Array, checkpoint:
 
 
 def _segment(steps: int) -> int:
-    """About sqrt(steps), and a divisor of it if there is one."""
+    """Returns a segment length of about sqrt(steps), a divisor of `steps` if there is one."""
     root = math.isqrt(steps)
     return next((length for length in range(root, root // 2, -1) if steps % length == 0), root)

@@ -1,4 +1,4 @@
-"""How a rollout is computed: the one declaration of what `rollout`, `measure`, `sweep` and `record_sweep` share."""
+"""Simulation settings, declared once for `rollout`, `measure`, `sweep` and `record_sweep`."""
 
 import math
 from typing import Any, Literal, NamedTuple, Required, TypeAlias, TypedDict, cast, get_args
@@ -14,31 +14,31 @@ Derivative: TypeAlias = Literal["pathwise", "mean"]
 
 
 class Simulation(TypedDict, total=False):
-    """The keyword arguments that say how a rollout is computed.
+    """Keyword arguments that define how a rollout is computed.
 
     Attributes:
       duration: a whole number of steps [s]. Required.
       dt: the integrator's step [s]. Required.
       clock: "sampled" evaluates the controller once per control period and holds its command (zero-order hold), as
         firmware does; "continuous" evaluates the law in every stage of the integrator, and takes no controller with a
-        memory of its own. By default "sampled", or "continuous" where located switching is asked for.
-      control_period: of the sampled clock, a whole number of steps [s]; by default one step.
-      switching: "per_step", the default: the mode is read at the control instants and kept in between. "located", on
-        the continuous clock: changes of mode, and the moments at which the voltage reaches the limit or leaves it, are
-        found inside their steps, and derivatives know that they move (see docs/gradients.md). In each mode the law has
-        to be continuous in the state; a StateFeedback alone is not, at theta = pi. The events of a plant that has some
-        (`cpjax.sim.plants.Eventful`) are located on either clock.
+        memory of its own. By default "sampled", or "continuous" with located switching.
+      control_period: period of the sampled clock, a whole number of steps [s]; by default one step.
+      switching: "per_step", the default: the mode is updated at control instants and constant in between. "located",
+        on the continuous clock: changes of mode, and the instants at which the voltage reaches or leaves its limit, are
+        found inside their steps, and derivatives include how they move with the parameters (see docs/gradients.md). In
+        each mode the law must be continuous in the state; a StateFeedback alone is not, at theta = pi. The events of a
+        plant that has some (`cpjax.sim.plants.Eventful`) are located on either clock.
       integrator: a key of `cpjax.sim.integrators.INTEGRATORS`; "rk4" by default.
-      save_every: keep every so many steps; has to divide their number. None keeps no trajectory. `rollout` keeps all by
-        default, `sweep` none; `measure` does not take it.
-      spare_steps: of located events, each of which takes four steps: the most that they may take together. A run that
-        needs more is stopped and flagged. By default 64 and a sixteenth of the steps.
-      checkpoint: what reverse mode remembers: the state at the ends of "segments" of about sqrt(n) steps, or at
-        "every_step", which takes more memory. Nothing else depends on it. (With switching per step, `rollout` remembers
-        the saved states, whatever is asked for, and `measure` after `cpjax.configure_cpu` always "segments".)
-      derivative: where the moment of a change of mode does not move with the parameters, because it falls on a control
-        instant, "pathwise" leaves its effect out; "mean", on the sampled clock, adds it: the result is the derivative
-        of the mean over initial states (see docs/gradients.md). Without either, differentiating such a loop warns.
+      save_every: number of steps between saved samples, a divisor of the number of steps. None saves no trajectory.
+        `rollout` saves every step by default, `sweep` none; `measure` does not take it.
+      spare_steps: largest number of additional steps for located events, of which each takes four. A run that needs
+        more is stopped and flagged. By default 64 plus a sixteenth of the steps.
+      checkpoint: what reverse mode stores: the state at the ends of "segments" of about sqrt(n) steps, or at
+        "every_step", which takes more memory. Nothing else depends on it. (With switching per step, `rollout` stores
+        the saved states regardless of it, and `measure` after `cpjax.configure_cpu` always "segments".)
+      derivative: where the instant of a change of mode does not move with the parameters, because it falls on a control
+        instant, "pathwise" omits its effect; "mean", on the sampled clock, adds it: the result is the derivative of the
+        mean over initial states (see docs/gradients.md). Without either, differentiating such a loop warns.
     """
 
     duration: Required[float]
@@ -54,26 +54,26 @@ class Simulation(TypedDict, total=False):
 
 
 class Settings(NamedTuple):
-    """What a compilation depends on, beside structures and dtypes; see `Simulation`."""
+    """Static settings of a compilation, beside structures and dtypes; see `Simulation`."""
 
     steps: int
     save_every: int | None
-    """None: metrics only."""
+    """Number of steps between saved samples; None for metrics only."""
     clock: Clock
     steps_per_control: int
     switching: Switching
     spare_steps: int
-    """Beyond `steps`, for crossings; 0 where none are located."""
+    """Iterations beyond `steps`, for crossings; 0 where none are located."""
     integrator: str
     checkpoint: Checkpoint
     derivative: Derivative | None
     fast_path: bool = False
-    """Values only: held steps by `step_held_incremental`, and no run is held where it goes wrong. A start for which
-    that was not right has the flag `NEEDS_RECOMPUTE`, and all else about it means nothing."""
+    """Fast path, for values only: held steps by `step_held_incremental`, without failure handling. Initial states for
+    which it is invalid carry the flag `NEEDS_RECOMPUTE`; their other outputs are undefined."""
 
 
 def check_names(function: str, simulation: Any) -> None:
-    """Checks the names of keyword arguments, as Python does for those that a function declares itself.
+    """Checks the names of keyword arguments, as Python does for those in a function's signature.
 
     Raises:
       TypeError: a name that `Simulation` does not have, or one of its required names is missing.
@@ -101,7 +101,7 @@ def check_settings(
     derivative: Any = None,
     events: bool = False,
 ) -> Settings:
-    """Returns the settings of a rollout; `save_every` None for metrics only.
+    """Checks the arguments of `Simulation` and returns the settings of a rollout.
 
     Args:
       events: whether the plant has events of its own, which are located on either clock.
@@ -184,7 +184,7 @@ def _positive_seconds(field: str, value: Any) -> float:
 
 
 def _whole_steps(field: str, seconds: float, dt: float) -> int:
-    """Returns how many steps of `dt` make `seconds`; decimal fractions such as 0.3 / 0.1 count as whole."""
+    """Returns how many steps of `dt` make `seconds`, up to rounding: 0.3 / 0.1 counts as whole."""
     if not seconds / dt < 2**31:
         raise InputError(field, seconds, f"fewer than 2^31 steps of dt = {dt:g} s")
     steps = round(seconds / dt)

@@ -1,4 +1,4 @@
-"""One step of the closed loop: plant, input and integrator put together."""
+"""One step of the closed loop: plant, input and integrator combined."""
 
 from typing import Any
 
@@ -14,12 +14,12 @@ from cpjax.sim.plants import Plant, Tree
 
 
 def applied_voltage(plant: Plant, controller: ModalController, state: Tree, mode: jax.Array) -> jax.Array:
-    """Returns what the plant gets: the law's demand in `mode`, in the state's dtype, clipped by the drive."""
+    """Returns the plant's input: the law's demand in `mode`, in the state's dtype, clipped by the drive."""
     return plants.saturate(plant, outline(demand)(controller, state, mode))
 
 
 def dtype_of(tree: Tree) -> Any:
-    """Returns the dtype that all numbers of a state have."""
+    """Returns the common dtype of the numbers of a state."""
     return jnp.asarray(jax.tree.leaves(tree)[0]).dtype
 
 
@@ -34,7 +34,7 @@ def step_held(
     """Returns the state after `dt` [s] under a constant input `u` (zero-order hold).
 
     Args:
-      first: the accelerations at `state`, if the caller has them.
+      first: the accelerations at `state`, if already known.
     """
 
     def acceleration(q: Tree, v: Tree) -> Tree:
@@ -53,11 +53,13 @@ def step_held_incremental(
     dt: Scalar,
     first: Tree | None = None,
 ) -> tuple[Tree, jax.Array]:
-    """As `step_held`, but the geometry at the later stages is derived from that at `state`; and whether it was
-    accurate.
+    """Computes `step_held` with the geometry at the later stages derived from that at `state`.
 
     Args:
       geometry: of the plant at `state`.
+
+    Returns:
+      The state after `dt` [s], and whether all its geometries were accurate to rounding.
     """
     accurate = jnp.asarray(True)
     start, velocities = plants.coordinates(plant, state)
@@ -85,7 +87,7 @@ def step_continuous(
     """Returns the state after `dt` [s] with the law of `mode` evaluated, and its voltage clipped, in every stage.
 
     Args:
-      first: the accelerations at `state`, if the caller has them.
+      first: the accelerations at `state`, if already known.
     """
 
     def acceleration(q: Tree, v: Tree) -> Tree:

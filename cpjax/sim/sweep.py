@@ -1,9 +1,9 @@
-"""Many starts at once, on every core or every accelerator.
+"""Sweeps: many initial states at once, on all cores or accelerators.
 
-Starts are simulated in blocks, which bound the memory and let progress be seen. A block is shared out to the devices
-(`jax.sharding`: the cores of a CPU that `cpjax.configure_cpu` made into devices, the GPUs of a machine, those of
-several hosts), and each works through its share in chunks: on a CPU so small that a chunk stays in the first cache.
-What is computed for a start does not depend on any of this.
+Initial states are simulated in blocks, which bound the memory and allow progress reports. A block is distributed over
+the devices (`jax.sharding`: the cores of a CPU that `cpjax.configure_cpu` made into devices, the GPUs of a machine,
+those of several hosts), and each device computes its share in chunks, on a CPU so small that a chunk stays in the
+first-level cache. The result for an initial state does not depend on this division.
 """
 
 import functools
@@ -30,23 +30,23 @@ from cpjax.sim.saved import SavedSamples
 from cpjax.sim.settings import Settings, Simulation, check_names
 
 Progress = Callable[[int, int], None]
-"""Called with the number of starts done and their total."""
+"""Function called with the number of initial states done and their total."""
 
 _CHUNK = 128
-"""Starts at a time on a CPU: their state stays in the first cache."""
+"""Initial states per chunk on a CPU: their state stays in the first-level cache."""
 
 _VECTOR = 16
-"""Numbers of float32 in the longest vectors of a CPU."""
+"""Number of float32 elements in the longest vectors of a CPU."""
 
 _STEPS_PER_BLOCK = 1 << 28
-"""About a second's work of a CPU."""
+"""Integrator steps per block on a CPU: about one second of computation."""
 
 _LARGEST_BLOCK = 1 << 30
-"""Bytes of results."""
+"""Bytes of results per block."""
 
 _LARGEST_BLOCK_OF_A_CPU = 1 << 25
-"""Small enough for the memory of one block to serve the next (glibc keeps what is freed up to this size): fresh memory
-is slower than a simulation."""
+"""Bytes of results per block on a CPU, small enough for the memory of one block to be reused for the next (glibc
+retains freed memory up to this size): obtaining fresh memory is slower than a simulation."""
 
 _AXIS = "starts"
 _SHARED_OUT: Any = PartitionSpec(_AXIS)  # type: ignore[no-untyped-call]  # untyped in JAX
@@ -64,20 +64,21 @@ def sweep(
     progress: Progress | None = None,
     **simulation: Unpack[Simulation],
 ) -> Any:
-    """Returns the metrics of every initial state, or their trajectories; see `rollout` for the other arguments.
+    """Simulates many initial states; returns their metrics or trajectories.
 
-    Results are those of `rollout` to rounding. With several processes (`jax.distributed`), each calls this with the
-    same arguments and gets the whole result.
+    Results equal those of `rollout` up to rounding. With several processes (`jax.distributed`), each calls this with
+    the same arguments and receives the whole result.
 
     Args:
       plant: one for all initial states, or one for each: any of its declared numbers may be an array of shape (n,).
-      controller: likewise; a gain may have shape (n, 1, 4). So may `metrics`.
+      controller: likewise; a gain may have shape (n, 1, 4).
       starts: the initial states: a `State` of arrays of shape (n,), any n, or the state of a plant of your own.
-      chunk: initial states that one device simulates together, at most; None for what suits the machine.
-      block: initial states computed between two calls of `progress`, at most; None for about a second's work of a CPU.
+      metrics: as in `rollout`; its numbers may have shape (n,).
+      chunk: largest number of initial states that one device simulates together; None chooses by the machine.
+      block: largest number of initial states between two calls of `progress`; None for about one second on a CPU.
       progress: called after each block.
-      simulation: see `cpjax.Simulation`. `save_every` None stores nothing of the trajectories; k keeps every k-th step,
-        for all n initial states, in memory (`cpjax.record_sweep` writes them to disk as they come).
+      simulation: see `cpjax.Simulation`. `save_every` None stores no trajectories; k saves every k-th step of all n
+        initial states in memory (`cpjax.record_sweep` writes them to disk block by block).
 
     Returns:
       What `metrics` returns for one initial state, with a leading axis n; `Metrics` by default. With `save_every`, a
@@ -100,29 +101,29 @@ def sweep(
             array[begin : begin + len(rows)] = rows
         if progress is not None:
             progress(min(begin + work.size, work.total), work.total)
-    return jax.tree.map(lambda array: jax.device_put(array, may_alias=True), whole)  # nobody else has it
+    return jax.tree.map(lambda array: jax.device_put(array, may_alias=True), whole)  # no other reference to it
 
 
 class _CompileKey(NamedTuple):
-    """What a compilation depends on, beside shapes and dtypes."""
+    """Static arguments of a compilation, beside shapes and dtypes."""
 
     structure: Any
-    """Of (start, (plant, controller, fold, dt))."""
+    """Tree structure of (start, (plant, controller, fold, dt))."""
     batched: tuple[bool, ...]
-    """Which of its leaves have one entry for each start."""
+    """Whether each leaf of that structure has one entry per initial state."""
     settings: Settings
     chunk: int
     mesh: Mesh
 
 
 class SweepPlan(NamedTuple):
-    """A sweep, ready to be done a block at a time."""
+    """Prepared sweep, computed one block at a time."""
 
     kind: _CompileKey
     leaves: list[Any]
     total: int
     size: int
-    """Starts of a block; the last one is filled up with copies of the last start."""
+    """Initial states per block; the last block is padded with copies of the last initial state."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -132,17 +133,17 @@ class SweepPlan(NamedTuple):
 
     @property
     def traced(self) -> bool:
-        """Whether JAX is tracing any of the numbers that go in."""
+        """Returns whether JAX is tracing any of the input numbers."""
         return any(is_traced(leaf) for leaf in self.leaves)
 
     def block_offsets(self) -> range:
-        """Where the blocks begin."""
+        """Returns the index of the first initial state of each block."""
         return range(0, self.total, self.size)
 
     def blocks(self, block_offsets: Iterable[int]) -> Iterator[Any]:
-        """The results of up to `size` starts from each of `block_offsets` on, as NumPy arrays.
+        """Yields the results of up to `size` initial states from each of `block_offsets` on, as NumPy arrays.
 
-        While the caller has one, the devices work on the next.
+        While the caller processes one block, the devices compute the next.
         """
         waiting: tuple[int, Any] | None = None
         for begin in block_offsets:
@@ -155,16 +156,16 @@ class SweepPlan(NamedTuple):
             yield self._collect(*waiting)
 
     def structure(self) -> Any:
-        """The tree that a block's results are leaves of."""
+        """Returns the tree structure of a block's results."""
         columns, shared = _split(self.leaves, self.kind.batched)
         first = [column[0] for column in columns]
         return jax.tree.structure(jax.eval_shape(lambda: results(*_one(first, shared, self.kind))))
 
     def _compute(self, members: np.ndarray, kind: _CompileKey) -> Any:
-        """Results and flags of these starts, still being computed."""
+        """Returns results and flags of these initial states, dispatched asynchronously."""
         columns, shared = _split(self.leaves, kind.batched)
         placed = [_place(np.asarray(column)[members], NamedSharding(kind.mesh, _SHARED_OUT)) for column in columns]
-        # As few arrays as can be: to hand over dozens takes longer than a small sweep.
+        # Packed into one array per dtype: transferring dozens of arrays takes longer than a small sweep.
         numbers = [np.asarray(leaf) for leaf in shared]
         forms = tuple((leaf.shape, leaf.dtype.str) for leaf in numbers)
         packed = {
@@ -178,12 +179,12 @@ class SweepPlan(NamedTuple):
         result, flag = jax.tree.map(lambda array: _gather(array)[: self.total - begin], results)
         doubtful = np.flatnonzero(flag & NEEDS_RECOMPUTE)
         if doubtful.size:
-            result = jax.tree.map(np.array, result)  # may be written to
+            result = jax.tree.map(np.array, result)  # writable copies
             kind = self.kind._replace(settings=self.kind.settings._replace(fast_path=False))
             together = kind.chunk * kind.mesh.size
             for first in range(0, doubtful.size, together):
                 rows = doubtful[first : first + together]
-                members = np.resize(begin + rows, together)  # always as many: one compilation
+                members = np.resize(begin + rows, together)  # constant size, for a single compilation
                 in_full, _ = jax.tree.map(_gather, self._compute(members, kind))
                 for array, again in zip(jax.tree.leaves(result), jax.tree.leaves(in_full), strict=True):
                     array[rows] = again[: rows.size]
@@ -200,7 +201,7 @@ def prepare(
     block: int | None,
     **simulation: Any,
 ) -> SweepPlan:
-    """Checks a sweep's arguments and divides its initial states into blocks; arguments and errors of `sweep`."""
+    """Checks a sweep's arguments and divides its initial states into blocks; arguments and errors as for `sweep`."""
     for name, value in (("chunk", chunk), ("block", block)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
             raise InputError(name, value, "a whole number of starts, at least 1")
@@ -219,7 +220,7 @@ def prepare(
 def _sizes(
     total: int, devices: list[Any], settings: Settings, itemsize: int, chunk: int | None, block: int | None
 ) -> tuple[int, int]:
-    """Starts of a chunk, and of a block: as many chunks for each device."""
+    """Returns the initial states per chunk and per block, with equally many chunks for each device."""
     on_cpu = devices[0].platform == "cpu"
     saved = 0 if settings.save_every is None else settings.steps // settings.save_every + 1
     most = (_LARGEST_BLOCK_OF_A_CPU if on_cpu else _LARGEST_BLOCK) // (itemsize * 8 * (saved + 2))
@@ -229,7 +230,7 @@ def _sizes(
     share = math.ceil(total / len(devices))
     if chunk is None:
         best = _CHUNK if on_cpu else most
-        chunk = min(best, _VECTOR * math.ceil(share / _VECTOR))  # whole vectors, and a few starts make no whole chunk
+        chunk = min(best, _VECTOR * math.ceil(share / _VECTOR))  # whole vectors; few initial states need no full chunk
     chunk = min(chunk, most)
     chunks = math.ceil(share / chunk)
     blocks = math.ceil(chunks / (most // chunk))
@@ -242,7 +243,7 @@ def _split(leaves: list[Any], batched: tuple[bool, ...]) -> tuple[list[Any], lis
 
 
 def _one(column: list[Any], shared: list[Any], kind: _CompileKey) -> tuple[SavedSamples | None, Sample, Any]:
-    """What `simulate` returns, of one start."""
+    """Returns the result of `simulate` for one initial state."""
     columns, others = iter(column), iter(shared)
     leaves = [next(columns) if many else next(others) for many in kind.batched]
     start, (plant, controller, fold, dt) = jax.tree.unflatten(kind.structure, leaves)
@@ -250,7 +251,7 @@ def _one(column: list[Any], shared: list[Any], kind: _CompileKey) -> tuple[Saved
 
 
 _Forms: TypeAlias = tuple[tuple[tuple[int, ...], str], ...]
-"""Shape and dtype of each leaf that all starts share."""
+"""Shape and dtype of each leaf that all initial states share."""
 
 
 def _block(columns: list[jax.Array], packed: dict[str, jax.Array], kind: _CompileKey, forms: _Forms) -> Any:
@@ -276,7 +277,7 @@ def _block(columns: list[jax.Array], packed: dict[str, jax.Array], kind: _Compil
 
 
 def _stacked(tree: Any) -> list[jax.Array]:
-    """Leaves of a kind as one array: of several, XLA copies all that a loop has written at every write."""
+    """Stacks leaves of equal shape and dtype: for several arrays, XLA copies all that is written at every write."""
     kinds: dict[Any, list[jax.Array]] = {}
     for leaf in jax.tree.leaves(tree):
         kinds.setdefault((leaf.shape, leaf.dtype), []).append(leaf)
@@ -284,7 +285,7 @@ def _stacked(tree: Any) -> list[jax.Array]:
 
 
 def _unstacked(stacks: list[jax.Array], like: Any) -> Any:
-    """What `_stacked` was given, of the shapes `like`; all with a leading axis more."""
+    """Inverts `_stacked` for a tree of the shapes `like`, with one additional leading axis on all arrays."""
     leaves, structure = jax.tree.flatten(like)
     kinds = list(dict.fromkeys((leaf.shape, leaf.dtype) for leaf in leaves))
     taken = dict.fromkeys(kinds, -1)
@@ -310,7 +311,7 @@ def _compiled(platform: str) -> Any:
 
 
 def _unwritten(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-    """A NumPy array where JAX can use it as it is, without a copy: at a multiple of 64 bytes."""
+    """Returns an uninitialised NumPy array aligned to 64 bytes, which JAX can use without a copy."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     memory = np.empty(size + 64, np.uint8)
     begin = -memory.ctypes.data % 64

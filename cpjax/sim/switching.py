@@ -1,25 +1,25 @@
-"""Fixed steps through mode changes that happen inside them. Knows no cart-pole.
+"""Fixed steps with changes of mode located inside them. Independent of the plant.
 
-A system q'' = a(q, v) in a mode is smooth; guards, smooth functions of q and v, stay positive while the mode lasts. A
-step after which a guard is negative has gone too far. It is not taken: its crossing is located, the step is repeated
-up to there, the mode changes, and another step goes on to the end of the first. So every Runge-Kutta step stays inside
-one mode, which keeps the method's order, and the moment of the change moves with the parameters as it does in the
-continuous system, which keeps the derivatives.
+A system q'' = a(q, v) is smooth within a mode; guards, smooth functions of q and v, stay positive while the mode lasts.
+A step after which a guard is negative is rejected: the crossing is located, the step is repeated up to it, the mode
+changes, and another step completes the first. So every Runge-Kutta step stays inside one mode, which preserves the
+method's order, and the instant of the change moves with the parameters as in the continuous system, which preserves the
+derivatives.
 
-All of it is one small automaton, one integrator step an iteration, so that under `vmap` each system of a batch keeps
-its own motion in time and a crossing in one costs the others nothing. What an iteration does depends on `Motion.stage`:
+This is a small state machine with one integrator step per iteration, so that under `vmap` each batch element advances
+in its own time and a crossing in one costs the others nothing. `Motion.stage` determines what an iteration does:
 
-    RUN     a step to the next grid point; taken, or, if a guard fell, a crossing is located: stage 1
-    1, ...  the step up to where the crossing is thought to be, corrected by Newton's method; after the last: LANDED
-    LANDED  a step of no length, after which everything is known in the new mode; then RUN, for the rest of the step
+    RUN     a step to the next grid point; accepted, or, if a guard fell, a crossing is located: stage 1
+    1, ...  the step up to the estimated crossing, corrected by Newton's method; after the last correction: LANDED
+    LANDED  a step of zero length, which evaluates everything in the new mode; then RUN, for the rest of the step
 
-A crossing takes `CROSSING_COST` iterations more than a step without one, and a few more where the cubic on which it is
-first looked for is nothing like the guard, so that the step has to be halved. What falls and rises again within one
-step is not noticed.
+A crossing takes `CROSSING_COST` iterations more than a step without one, and a few more where the cubic of the first
+estimate approximates the guard so badly that the step must be halved. A guard that falls and rises again within one
+step is not detected.
 
-Derivatives: located times have none; the Newton corrections have the one of the implicit function theorem. One
-correction would do for the true flow. The program's flow is that of the integrator, whose derivative in time is not
-quite the vector field; each correction multiplies the difference by the integrator's relative error.
+Derivatives: located times have none; the Newton corrections have that of the implicit function theorem. For the exact
+flow one correction would suffice. The computed flow is that of the integrator, whose time derivative differs slightly
+from the vector field; each correction multiplies the difference by the integrator's relative error.
 """
 
 from typing import Any, NamedTuple, Protocol, TypeAlias
@@ -40,70 +40,70 @@ RUN, LANDED = 0, -1
 _CORRECTIONS = 2
 
 CROSSING_COST = _CORRECTIONS + 2
-"""Iterations that a crossing takes beyond those of a step without one."""
+"""Iterations that a crossing takes in addition to those of a step without one."""
 
 
 class Observation(NamedTuple):
-    """What a system is at one instant, in one mode."""
+    """Evaluation of a system at one instant, in one mode."""
 
     acceleration: Tree
-    """q''."""
+    """Accelerations q''."""
     guards: Guards
-    """At least 0 while the mode lasts."""
+    """Guards, at least 0 while the mode lasts."""
     output: Tree
-    """Whatever else the caller wants to know."""
+    """Further quantities for the caller."""
 
 
 class System(Protocol):
-    """q'' = a(q, v) with modes."""
+    """Second-order system q'' = a(q, v) with modes."""
 
     def observe(self, q: Tree, v: Tree, mode: Tree) -> Observation:
-        """Smooth in q and v."""
+        """Returns the accelerations, guards and output, smooth in q and v."""
         ...
 
     def jump(self, q: Tree, v: Tree, mode: Tree, guard: jax.Array) -> tuple[Tree, Tree, Tree]:
-        """q, v and mode after the guard of this number (int32) has fallen."""
+        """Returns q, v and mode after the guard of this number (int32) has fallen."""
         ...
 
 
 class Motion(NamedTuple):
-    """Where a system is in time and between its steps."""
+    """Position of a system in time and within the state machine."""
 
     q: Tree
     v: Tree
     mode: Tree
     seen: Observation
-    """At (q, v) in `mode`; just after a crossing, at the end of the mode before."""
+    """Observation at (q, v) in `mode`; just after a crossing, at the end of the previous mode."""
     slopes: Guards
-    """d guards / dt; without a derivative."""
+    """d guards / dt, not differentiable."""
     passed: jax.Array
-    """Grid points passed, int32."""
+    """Number of grid points passed, int32."""
     offset: jax.Array
-    """Time since the last grid point."""
+    """Time since the last grid point [s]."""
     step: jax.Array
-    """What the next iteration tries."""
+    """Step that the next iteration tries [s]."""
     elapsed: jax.Array
-    """Time between the last two points that were reached."""
+    """Time between the last two points that were reached [s]."""
     stage: jax.Array
     guard: jax.Array
     """Number of the guard whose crossing is being located, int32."""
     reach: jax.Array
-    """A step after which that guard has fallen."""
+    """Length of a step after which that guard has fallen [s]."""
     crossings: jax.Array
-    """Since the last grid point, int32."""
+    """Number of crossings since the last grid point, int32."""
 
 
 def start_motion(system: System, q: Tree, v: Tree, mode: Tree, dt: jax.Array) -> Motion:
-    """At the first grid point."""
+    """Returns the motion at the first grid point, with steps of `dt` [s]."""
     seen, slopes = observe(system, q, v, mode)
     none = jnp.zeros_like(dt, dtype=jnp.int32)
     return Motion(q, v, mode, seen, slopes, none, 0.0 * dt, dt, 0.0 * dt, none + RUN, none, dt, none)
 
 
 def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Array) -> tuple[Motion, jax.Array]:
-    """One step, or one try at one. The second result says whether a new point of the motion was reached.
+    """Performs one integrator step, accepted or rejected; also returns whether a new point of the motion was reached.
 
-    Points are reached on the grid, and at each crossing, in the new mode.
+    Points are reached on the grid and at each crossing, there in the new mode.
     """
     seen, step, stage = motion.seen, motion.step, motion.stage
     q, v = integrator(
@@ -112,7 +112,7 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Arra
     ahead, slopes = observe(system, q, v, motion.mode)
     landed, locating = stage == LANDED, stage >= 1
 
-    # Newton's correction, unless it goes too far to be one: then the cubic was not like the guard.
+    # Newton's correction, unless it is too large to be valid: then the cubic approximated the guard badly.
     value = pick(ahead.guards, motion.guard)
     steepness = (jnp.abs(pick(seen.guards, motion.guard)) + jnp.abs(value)) / dt
     correction = newton_correction(value, pick(slopes, motion.guard), steepness)
@@ -123,7 +123,7 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Arra
     corrected = step + correction
 
     # The first guard to fall, if any. The one whose crossing is being located is about zero, of either sign; another
-    # one that falls with it is left for afterwards.
+    # one that falls at the same time is located afterwards.
     soonest, first = jnp.full_like(step, jnp.inf), jnp.zeros_like(motion.guard)
     for number, (before, after) in enumerate(zip(seen.guards, ahead.guards, strict=True)):
         sought = locating & (motion.guard == number)
@@ -142,7 +142,7 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Arra
     )
     fraction = jnp.where(missed, 0.5, fraction)
 
-    short = missed & ~fell  # not yet there: this point is as good as any to go on from
+    short = missed & ~fell  # short of the crossing: continue from this point
     refine = locating & ~fell & ~short & (stage < _CORRECTIONS)
     land = locating & ~fell & ~short & (stage >= _CORRECTIONS)
     reached = short | ~(fell | locating)
@@ -180,7 +180,7 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Arra
 
 
 def observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, Guards]:
-    """Returns the system's observation, and how fast its guards change, without a derivative."""
+    """Returns the system's observation, and the rates of change of its guards, which are not differentiable."""
     seen = system.observe(q, v, mode)
     rates = lax.stop_gradient((v, seen.acceleration))
     guards = lambda q, v: system.observe(q, v, mode).guards  # noqa: E731
@@ -189,7 +189,7 @@ def observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, 
 
 
 def pick(values: Guards, number: jax.Array) -> jax.Array:
-    """values[number], without a gather: under `vmap` each of them is an array of its own."""
+    """Returns values[number] without a gather, as under `vmap` each value is an array of its own."""
     picked = jnp.asarray(values[0])
     for k, value in enumerate(values[1:], start=1):
         picked = jnp.where(number == k, value, picked)

@@ -1,1 +1,1 @@
-"""Questions asked of many rollouts."""
+"""Studies computed from many rollouts: basins, gradient audits, design checks and trade-off fronts."""

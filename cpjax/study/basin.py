@@ -1,6 +1,6 @@
-"""Where a controller works: one closed-loop run from every cell of a map over two coordinates of the start.
+"""Sampled basin of attraction: one closed-loop run from each cell of a grid over two coordinates of the initial state.
 
-What a map shows is sampled, not certified: a start between two that succeed may fail.
+The basin is sampled, not certified: an initial state between two that succeed may fail.
 """
 
 import dataclasses
@@ -17,8 +17,8 @@ from cpjax.pytree import Number
 from cpjax.sim.metrics import Metrics
 
 MOST_CELLS = 4096
-"""Along one axis."""
-_SIGMAS = 1.959963984540054  # of a normal distribution, that hold 95 %
+"""Largest number of cells along one axis."""
+_SIGMAS = 1.959963984540054  # half width of the central 95 % of a normal distribution, in standard deviations
 _FINITE = Number("SI unit", "")
 
 
@@ -30,7 +30,7 @@ def _finite(name: str, value: Any) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Axis:
-    """One coordinate of the start, in `cells` equal cells from `low` to `high`."""
+    """One coordinate of the initial state, divided into `cells` equal cells from `low` to `high`."""
 
     name: str
     low: float
@@ -49,24 +49,24 @@ class Axis:
 
     @property
     def unit(self) -> str:
-        """Of the coordinate."""
+        """Unit of the coordinate."""
         return UNITS[NAMES.index(self.name)]
 
     def edges(self) -> np.ndarray[Any, Any]:
-        """Of the cells (cells + 1,)."""
+        """Returns the edges of the cells (cells + 1,), in `unit`."""
         return np.linspace(self.low, self.high, self.cells + 1)
 
 
 @dataclasses.dataclass(frozen=True)
 class StartGrid:
-    """Which starts a basin is sampled from: one in each cell, anywhere in it.
+    """Grid of initial states for a sampled basin: one in each cell, at a random position within it.
 
     Attributes:
       across: the horizontal axis.
-      up: the vertical one.
-      others: (low, high) of the other two coordinates, between which each start's are drawn; (0, 0) where nothing is
-        given.
-      seed: of where in its cell a start lies.
+      up: the vertical axis.
+      others: (low, high) of the other two coordinates, between which each initial state's value is drawn uniformly;
+        (0, 0) where nothing is given.
+      seed: of the random numbers.
     """
 
     across: Axis
@@ -76,18 +76,18 @@ class StartGrid:
 
     def __post_init__(self) -> None:
         if self.across.name == self.up.name:
-            raise InputError("Map.up", self.up.name, f"another coordinate than across, {self.across.name}")
+            raise InputError("StartGrid.up", self.up.name, f"another coordinate than across, {self.across.name}")
         free = [name for name in NAMES if name not in (self.across.name, self.up.name)]
         for name, ends in self.others.items():
             if name not in free:
-                raise InputError("Map.others", name, "one of " + ", ".join(free))
+                raise InputError("StartGrid.others", name, "one of " + ", ".join(free))
             if not isinstance(ends, (tuple, list)) or len(ends) != 2:
-                raise InputError(f"Map.others[{name}]", ends, "two finite numbers, the lower one first")
-            low, high = (_finite(f"Map.others[{name}]", end) for end in ends)
+                raise InputError(f"StartGrid.others[{name}]", ends, "two finite numbers, the lower one first")
+            low, high = (_finite(f"StartGrid.others[{name}]", end) for end in ends)
             if low > high:
-                raise InputError(f"Map.others[{name}]", ends, "two finite numbers, the lower one first")
+                raise InputError(f"StartGrid.others[{name}]", ends, "two finite numbers, the lower one first")
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
-            raise InputError("Map.seed", self.seed, "a whole number, at least 0")
+            raise InputError("StartGrid.seed", self.seed, "a whole number, at least 0")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -96,13 +96,13 @@ class StartGrid:
 
     @property
     def middle(self) -> dict[str, float]:
-        """Of the coordinates that are no axes."""
+        """Middle of the range of each coordinate that is not an axis, by name."""
         return {
             n: 0.5 * sum(self.others.get(n, (0.0, 0.0))) for n in NAMES if n not in (self.across.name, self.up.name)
         }
 
     def starts(self) -> State:
-        """One start of each cell, as arrays (rows * columns,), the lowest row first."""
+        """Returns one initial state of each cell, as arrays (rows * columns,), the lowest row first."""
         random = np.random.default_rng(self.seed)
         rows, columns = self.shape
         found = {}
@@ -124,12 +124,12 @@ class StartGrid:
 
 @dataclasses.dataclass(frozen=True)
 class Area:
-    """Of the part of a map that a controller brings to rest.
+    """Area of the part of a grid from which a controller succeeds.
 
     Attributes:
-      value: in the product of the axes' units.
-      half_width: of its 95 % interval.
-      share: of the map.
+      value: area, in the product of the axes' units.
+      half_width: half width of its 95 % interval, in the same unit.
+      share: area relative to the whole grid [1].
     """
 
     value: float
@@ -138,12 +138,16 @@ class Area:
 
 
 def area(chart: StartGrid, success: np.ndarray[Any, Any]) -> Area:
-    """The basin's area, from the successes of the chart's starts (rows * columns,).
+    """Estimates the basin's area and its uncertainty.
 
-    One random start in each cell is a stratified sample. Its mean is unbiased, and its variance is that within the
-    cells alone: estimated from the differences of neighbours, which can only make it too large on average (Wolter,
-    Introduction to Variance Estimation, 2007, ch. 8). Where all succeed or none does, there are no differences: then
-    the other end of Wilson's interval says how large a part may have been missed.
+    One random initial state in each cell is a stratified sample. Its mean is unbiased, and its variance is that within
+    the cells alone: estimated from the differences of neighbours, which on average can only overestimate it (Wolter,
+    Introduction to Variance Estimation, 2007, ch. 8). If all succeed or none does, there are no differences: then the
+    width of Wilson's interval bounds the part that may have been missed.
+
+    Args:
+      chart: the grid.
+      success: whether the run from each of the grid's initial states succeeded (rows * columns,), bool.
     """
     caught = np.asarray(success, float).reshape(chart.shape)
     differences = [np.mean(np.diff(caught, axis=axis) ** 2) for axis in (0, 1)]
@@ -158,7 +162,7 @@ def area(chart: StartGrid, success: np.ndarray[Any, Any]) -> Area:
 
 
 def document(chart: StartGrid, metrics: Metrics) -> dict[str, Any]:
-    """A basin in a few numbers, for JSON."""
+    """Returns a summary of a basin as plain values, for JSON; `metrics` are arrays (rows * columns,)."""
     good = np.asarray(metrics.success)
     times, switches = np.asarray(metrics.settling_time)[good], np.asarray(metrics.switches)[good]
     found = area(chart, good)

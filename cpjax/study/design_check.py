@@ -1,4 +1,4 @@
-"""What a linear regulator is worth on a plant with a voltage limit: poles, margins, saturation, a certified region."""
+"""Checks of a linear regulator on a plant with a voltage limit: poles, margins, saturation, a certified region."""
 
 import dataclasses
 import math
@@ -28,7 +28,7 @@ from cpjax.plant.state import NAMES
 
 @dataclasses.dataclass(frozen=True)
 class DesignCheck:
-    """What `check_design` found. The level and its extent are None where the linear loop is not stable.
+    """Result of `check_design`. `P`, `level`, `limited_by` and `extent` are None if the linear loop is not stable.
 
     Attributes:
       K: the gain (1, 4).
@@ -36,13 +36,13 @@ class DesignCheck:
       margins: of the loop broken at the voltage.
       controllability: of the linear model from the voltage.
       observability: of the linear model from x and theta.
-      gate_angle: the angle at which the gate opens at rest, cart in place [rad].
-      gate_voltage: what the gain asks for there [V].
-      saturation_angle: the angle beyond which it asks for more than there is [rad].
-      P: Lyapunov function s' P s of the linear closed loop, falling with s' s (4, 4).
-      level: the largest s' P s that stays inside clip and gate.
-      limited_by: which of the two ends it, "voltage" or "gate".
-      extent: how far each coordinate reaches inside that level set, in the order of the state.
+      gate_angle: angle at which the gate opens, at rest with the cart at its reference [rad].
+      gate_voltage: magnitude of the voltage demanded there [V].
+      saturation_angle: angle beyond which, in the same state, the demand exceeds the voltage limit [rad].
+      P: matrix of the linear closed loop's Lyapunov function s' P s, whose derivative is -s' s (4, 4).
+      level: the largest s' P s whose level set lies inside the voltage limit and the gate.
+      limited_by: which of the two bounds the level, "voltage" or "gate".
+      extent: largest value of each coordinate in that level set, in the order of the state [SI].
     """
 
     K: np.ndarray[Any, Any]
@@ -60,11 +60,16 @@ class DesignCheck:
 
 
 def check_design(plant: CartPole, regulator: StateFeedback, gate: Gate) -> DesignCheck:
-    """The checks of a regulator behind a gate, on the plant's linear model about upright.
+    """Checks a regulator behind a gate, on the plant's linear model about upright.
+
+    Args:
+      plant: the plant.
+      regulator: the linear law, of any cart reference.
+      gate: an `AngleGate`, `AngleRateGate` or `LyapunovGate`.
 
     Raises:
-      InputError: a regulator that is no StateFeedback, a gate that is not one of the library's, or one of the two
-        about another state than upright at rest.
+      InputError: a regulator that is no StateFeedback, a gate that is not one of the library's, one of the two about
+        another state than upright at rest, or a LyapunovGate about another x or whose P is not positive definite.
     """
     if not isinstance(regulator, StateFeedback):
         raise InputError("regulator", regulator, "a cpjax.StateFeedback")
@@ -107,7 +112,7 @@ def check_design(plant: CartPole, regulator: StateFeedback, gate: Gate) -> Desig
 
 
 def document(check: DesignCheck, **setting: Any) -> dict[str, Any]:
-    """The check as plain values, for JSON."""
+    """Returns the check as plain values, for JSON, beside the entries of `setting`."""
     return {
         "what": "a linear regulator on the plant's linear model about upright, behind a gate and a voltage limit",
         "versions": io.versions(),

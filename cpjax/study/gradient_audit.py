@@ -1,9 +1,9 @@
-"""Can a gradient through a swing-up be trusted? For a controller, its parameters, starts and an objective.
+"""Audit of gradients through a swing-up, for a controller, its parameters, initial states and an objective.
 
-Three ways to a derivative are held against the finite difference of the rollout with located switching: automatic
+Three derivatives are compared with the finite difference of the rollout with located switching: automatic
 differentiation of that rollout, of the rollout that reads its mode once per step ("plain"), and of rollouts with smooth
-surrogates. All of them at several horizons, and beside them what makes gradients bad: slow crossings of the gate, and
-sensitivity that grows with time.
+surrogates. All are computed at several horizons, together with the causes of bad gradients: slow crossings of the gate,
+and sensitivity that grows with time.
 """
 
 import dataclasses
@@ -34,26 +34,26 @@ from cpjax.study.named_parameters import Build, Numbers, as_matrix, as_tree, par
 Report: TypeAlias = Callable[[int, int, str], None]
 
 SLOW_CROSSING = 0.1
-"""Below this speed of the gate's margin [1/s] a crossing counts as grazing."""
+"""Speed of the gate's margin [1/s] below which a crossing counts as grazing."""
 
 LARGE_GROWTH = 1e4
-"""Above this norm of d state / d start a run counts as chaotic."""
+"""Norm of d state / d start above which a run counts as chaotic."""
 
 SMALL_SHARE = 1e-3
-"""A parameter's derivative is compared with itself, or with this share of the largest of its run, if that is more."""
+"""Errors are relative to the derivative, or to this share of the run's largest derivative, whichever is larger."""
 
 RESOLUTION = 3e-7
-"""A difference that is less certain than this, relative to what errors are relative to, decides nothing."""
+"""Largest uncertainty at which a difference counts as resolved, relative to the same size as errors are."""
 
 _STEPS = 1e-3 * 4.0 ** -np.arange(7)
 
 
 @dataclasses.dataclass(frozen=True)
 class GradientAudit:
-    """What `audit_gradients` found, for n starts, k horizons and d parameters.
+    """Result of `audit_gradients`, for n initial states, k horizons and d parameters.
 
-    Derivatives are with respect to relative changes: of a parameter p, p times the derivative in p, or its scale times
-    the derivative where a scale was given. Shape (n, k, d).
+    Derivatives are with respect to relative changes: |p| times the derivative in a parameter p, or its scale times the
+    derivative if a scale was given. Shape (n, k, d).
 
     Attributes:
       names: of the parameters, d; "Q[0]" for an element.
@@ -65,10 +65,10 @@ class GradientAudit:
       smooth: the same, one array for each temperature.
       difference: finite differences of the rollout with located switching; NaN where no stencil stays on one side of
         every kink.
-      uncertainty: of them, as they estimate it themselves.
-      crossings: of the gate (n, k).
-      speed: the slowest of those [1/s] (n, k); infinite if none.
-      growth: norm of d state / d start, in SI units (n, k).
+      uncertainty: estimated error of the differences, of their shape.
+      crossings: number of gate crossings up to each horizon (n, k).
+      speed: speed of the gate's margin at the slowest of those [1/s] (n, k); infinite if there is none.
+      growth: spectral norm of d state / d start, in SI units (n, k).
       flag: bits of `Flag` of the run with located switching (n,).
     """
 
@@ -87,23 +87,23 @@ class GradientAudit:
     flag: Numbers
 
     def errors(self, gradient: Numbers) -> Numbers:
-        """|gradient - difference| relative to the difference (n, k, d); see `SMALL_SHARE`. NaN where that is NaN."""
+        """Returns |gradient - difference| / |difference| (n, k, d), see `SMALL_SHARE`; NaN where the difference is."""
         size = np.abs(self.difference)
         distance = np.abs(gradient - self.difference)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(distance == 0.0, 0.0 * size, distance / np.maximum(size, SMALL_SHARE * self._largest()))
 
     def wrong_signs(self, gradient: Numbers) -> Numbers:
-        """Whether gradient and difference have different signs, zero being one, where the difference's is known."""
+        """Returns where the gradient's sign (-1, 0, 1) differs from the difference's, if that is certain (n, k, d)."""
         known = np.abs(self.difference) > np.maximum(self.uncertainty, SMALL_SHARE * self._largest())
         return known & (np.sign(gradient) != np.sign(self.difference))
 
     @property
     def resolved(self) -> Numbers:
-        """Whether the differences are good enough to tell errors of `RESOLUTION` (n, k, d).
+        """Whether the differences are certain to `RESOLUTION` (n, k, d).
 
-        Next to a kink (a crossing that comes or goes with a small step of a parameter) only the smallest stencils stay
-        on one side of it, and those are drowned by rounding.
+        Next to a kink (a crossing that appears or vanishes with a small step of a parameter) only the smallest stencils
+        stay on one side of it, and rounding dominates those.
         """
         with np.errstate(invalid="ignore"):
             size = np.maximum(np.abs(self.difference), SMALL_SHARE * self._largest())
@@ -117,23 +117,23 @@ class GradientAudit:
 
     @property
     def trusted(self) -> Numbers:
-        """Whether the verdict on a start is trustworthy (n,)."""
+        """Whether the verdict on an initial state is "trustworthy" (n,)."""
         return np.array([kind == "trustworthy" for kind, _ in self.verdicts])
 
     @property
     def compared(self) -> Numbers:
-        """Which derivatives a comparison is about: of trustworthy starts, where the difference decides (n, k, d)."""
+        """Which derivatives are compared: of trustworthy initial states, where the difference is resolved (n, k, d)."""
         compared: Numbers = self.trusted[:, None, None] & self.resolved
         return compared
 
     @property
     def undecided(self) -> int:
-        """How many derivatives of trustworthy starts no difference decides, at the last horizon."""
+        """Number of derivatives of trustworthy initial states whose difference is not resolved, at the last horizon."""
         return int(np.sum(self.trusted[:, None] & ~self.resolved[:, -1]))
 
     @property
     def verdicts(self) -> list[tuple[str, str]]:
-        """For each start: trustworthy, grazing, chaotic or stopped; and why. Over all horizons."""
+        """Verdict on each initial state (trustworthy, grazing, chaotic, stopped) and its reason, over all horizons."""
         found = []
         for flag, speed, growth, crossings in zip(
             self.flag, self.speed[:, -1], np.max(self.growth, axis=1), self.crossings[:, -1], strict=True
@@ -164,24 +164,25 @@ def audit_gradients(
     each: bool = False,
     progress: Report | None = None,
 ) -> GradientAudit:
-    """Compares the gradients of an objective at every start; see `GradientAudit`.
+    """Compares the gradients of an objective at every initial state.
 
     Args:
-      build: makes the plant and a `cpjax.Hybrid` of the parameters; run designs such as `cpjax.lqr` in it.
+      build: returns the plant and a `cpjax.Hybrid` for the parameters; run designs such as `cpjax.lqr` in it.
       parameters: numbers and vectors by name.
-      starts: a State of arrays (n,).
+      starts: the initial states, a State of float64 arrays (n,).
       duration: of the rollouts [s].
       dt: their step [s].
-      horizons: where the objective is read, rising, each a whole number of steps [s]; by default quarters of the
-        duration.
-      objective: a fold whose result is a number; `TimeOutside()` by default.
-      scales: what counts as a whole change of a parameter; by default its value.
+      horizons: times at which the objective is read, rising, each a whole number of steps [s]; by default quarters of
+        the duration.
+      objective: a metric whose result is a number; `TimeOutside()` by default.
+      scales: change of a parameter, by name, that counts as a relative change by 1; by default its value.
       temperatures: of the smooth surrogates: of the gate's margin, and of the clip relative to the supply.
-      each: whether the parameters have a leading axis n, one set for each start.
+      each: whether the parameters have a leading axis n, one set for each initial state.
       progress: called with the number of parts done, their total, and the next one's name.
 
     Raises:
-      InputError: arguments that no rollout takes, or a controller that is not a Hybrid.
+      InputError: arguments that no rollout takes, initial states that are not float64, or a controller that is not a
+        Hybrid.
     """
     starts, dtype, _ = checked_initial(CartPole(), starts, "starts", batched=True)
     check_settings(duration=duration, dt=dt, switching="located")
@@ -214,7 +215,7 @@ def audit_gradients(
                 law = SmoothClip(law, limit, temperature * limit)
         how: dict[str, Any] = {"duration": duration, "dt": dt, "clock": "continuous", "switching": switching}
         if switching == "per_step":
-            how["derivative"] = "pathwise"  # what the audit is there to show
+            how["derivative"] = "pathwise"  # its error is what the audit measures
         found: tuple[Probe, jax.Array] = measure(plant, law, start, metrics=fold, **how)
         return found
 
@@ -268,7 +269,7 @@ def audit_gradients(
 def _differences(
     probe: Callable[..., Any], x: Numbers, starts: State, scale: Numbers, found: Probe, report: Callable[[str], None]
 ) -> Differences:
-    """Of the rollout with located switching, in relative changes (n, k, d)."""
+    """Returns differences of the rollout with located switching, with respect to relative changes (n, k, d)."""
     n, d = x.shape
     run = jax.jit(jax.vmap(lambda vector, start: probe(vector, start, "located", None)[0]))
     many = jax.tree.map(lambda column: jnp.repeat(column, 2 * d), starts)
@@ -304,7 +305,7 @@ def _horizons(given: Sequence[float] | None, duration: float, dt: float) -> Numb
 
 
 def document(audit: GradientAudit, starts: State, **setting: Any) -> dict[str, Any]:
-    """The audit for programs."""
+    """Returns the audit as plain values, for JSON, beside the entries of `setting`."""
     columns = {name: np.asarray(getattr(starts, name)) for name in NAMES}
     fields = {f.name: getattr(audit, f.name) for f in dataclasses.fields(audit)}
     verdicts = [{"verdict": kind, "reason": reason} for kind, reason in audit.verdicts]

@@ -1,4 +1,4 @@
-"""The fold by which gradients are audited: an objective at several horizons, and the crossings that led to it."""
+"""Metric of the gradient audit: an objective at several horizons, and the crossings up to each."""
 
 from typing import Any, NamedTuple
 
@@ -11,16 +11,19 @@ from cpjax.sim.metrics import Fold, Sample
 
 
 class Probe(NamedTuple):
-    """At each horizon: the first axis."""
+    """Records at the k horizons, the first axis."""
 
     value: jax.Array
+    """Objective (k,)."""
     state: jax.Array
-    """(k, 4)."""
+    """State of the plant (k, 4) [SI]."""
     crossings: jax.Array
+    """Number of gate crossings so far (k,), int32."""
     speed: jax.Array
+    """Slowest speed of the gate's margin at those (k,) [1/s]; infinite if there is none."""
     path: jax.Array
-    """A number made of the sequence of crossings, of gate and supply, and of their steps: equal for equal sequences.
-    Where a crossing passes a sample, the samples' states, and what is summed of them, have a (small) kink."""
+    """Hash (k,), uint32, of the sequence of crossings, of gate and supply, and of the steps in which they lie. Steps
+    count because the samples' states, and sums over them, have a (small) kink where a crossing passes a sample."""
 
 
 class _Memory(NamedTuple):
@@ -33,13 +36,13 @@ class _Memory(NamedTuple):
 
 @pytree
 class HorizonRecorder:
-    """The fold that keeps an objective and what led to it at several horizons."""
+    """Metric that records an objective, the state and the crossings at several horizons."""
 
     objective: Fold = part("a fold", "init", "update", "finish")
     horizons: Any = None
-    """(k,) [s]."""
+    """Times of the records (k,) [s]."""
     dt: Any = None
-    """[s]."""
+    """Step of the rollout [s]."""
 
     def init(self, sample: Sample) -> _Memory:
         k, dtype = self.horizons.shape[0], sample.time.dtype

@@ -1,4 +1,4 @@
-"""The numbers of a closed loop by name, as they are: of plant, swing-up law, regulator and gate."""
+"""Parameters of a closed loop by name, untransformed: of plant, swing-up law, regulator and gate."""
 
 import dataclasses
 import math
@@ -19,11 +19,11 @@ from cpjax.pytree import numbers
 
 Numbers: TypeAlias = np.ndarray[Any, Any]
 Build: TypeAlias = Callable[[Mapping[str, jax.Array]], tuple[CartPole, Controller | Law]]
-"""Plant and controller of parameters. Traced."""
+"""Function from parameters by name, possibly traced, to plant and controller."""
 
 
 class Parametrisation(NamedTuple):
-    """What `audit_gradients` takes."""
+    """Arguments of `audit_gradients`."""
 
     build: Build
     parameters: dict[str, Any]
@@ -31,12 +31,16 @@ class Parametrisation(NamedTuple):
 
 
 def parametrise(plant: CartPole, controller: Hybrid) -> Parametrisation:
-    """The numbers of a closed loop by name: of the plant, the swing-up law, the regulator and the gate.
+    """Collects the parameters of a closed loop by name: of the plant, the swing-up law, the regulator and the gate.
 
-    The plant's are those of its own that are declared uncertain, and the supply's limit if it has one. The regulator's
-    are those of its design, the diagonal weights Q (4,) and R, or the characteristic polynomial of the four poles; or,
-    without a design or with a full Q, its gain K. The law's model of the plant, for which a gain is designed, does not
-    change with the plant.
+    The plant's are those of its own (not the motor's) that are declared uncertain, and its voltage limit if finite. The
+    law's are those that are not zero, without the kick. The regulator's are those of its design, the diagonal weights
+    Q (4,) and R, or the characteristic polynomial (4,) of the four poles; or, without a design or with a full Q, its
+    gain K (4,). The law's model of the plant, for which a gain is designed, does not change with the plant.
+
+    Args:
+      plant: the plant.
+      controller: a `Hybrid` with a `StateFeedback`.
 
     Raises:
       InputError: a controller that is not a Hybrid with a StateFeedback.
@@ -82,7 +86,16 @@ def parametrise(plant: CartPole, controller: Hybrid) -> Parametrisation:
 
 
 def as_matrix(parameters: Mapping[str, Any], n: int, each: bool) -> tuple[tuple[str, ...], Numbers, Any]:
-    """Names of the elements, values (n, d), and what makes the mapping again."""
+    """Returns names of the elements (d), values (n, d), and the shapes from which `as_tree` restores the mapping.
+
+    Args:
+      parameters: numbers and vectors by name.
+      n: number of initial states.
+      each: whether the parameters have a leading axis n.
+
+    Raises:
+      InputError: no parameter, or one that is not a finite number or vector, with that axis if `each`.
+    """
     names: list[str] = []
     columns, shapes = [], []
     for name, value in parameters.items():
@@ -102,7 +115,7 @@ def as_matrix(parameters: Mapping[str, Any], n: int, each: bool) -> tuple[tuple[
 
 
 def as_tree(vector: jax.Array, shapes: Any) -> dict[str, jax.Array]:
-    """The mapping again, of one row (d,) and the shapes that `as_matrix` found."""
+    """Returns the mapping from one row (d,) of values and the shapes that `as_matrix` returned."""
     tree, at = {}, 0
     for name, shape in shapes:
         size = math.prod(shape)
@@ -112,10 +125,15 @@ def as_tree(vector: jax.Array, shapes: Any) -> dict[str, jax.Array]:
 
 
 def parameter_scales(names: tuple[str, ...], x: Numbers, given: Mapping[str, float]) -> Numbers:
-    """What counts as a whole change of each element (n, d): what is given, or else its size.
+    """Returns the change of each element (n, d) that counts as a relative change by 1: given, or its magnitude.
+
+    Args:
+      names: of the elements, d.
+      x: values (n, d).
+      given: changes by name, of a parameter or of an element such as "Q[0]".
 
     Raises:
-      InputError: an unknown name, a change that is not above 0, or a parameter that is zero and has none.
+      InputError: an unknown name, a change that is not above 0, or a parameter that is zero without a given change.
     """
     scale = np.abs(x)
     known = {name.split("[")[0] for name in names} | set(names)

@@ -1,4 +1,4 @@
-"""A sweep on disk: saved block by block, gone on with after an interruption, and one file in the end."""
+"""A sweep on disk: saved block by block, resumed after an interruption, and assembled into one file."""
 
 import hashlib
 import io as buffers
@@ -22,9 +22,9 @@ from cpjax.sim.settings import Simulation, check_names
 from cpjax.sim.sweep import Progress, SweepPlan, prepare
 
 SUFFIXES = (".parquet", ".npz", ".json")
-"""Of the files that a sweep's metrics are written to."""
+"""Suffixes of the files that a sweep's metrics can be written to."""
 
-_DOCUMENT = "cpjax"  # under which an NPZ or Parquet file holds the document
+_DOCUMENT = "cpjax"  # key of the document in an NPZ or Parquet file
 
 
 def record_sweep(
@@ -40,16 +40,17 @@ def record_sweep(
     progress: Progress | None = None,
     **simulation: Unpack[Simulation],
 ) -> Any:
-    """Runs a `cpjax.sweep` whose results go to `path`, with plant, controller, settings and versions beside them.
+    """Runs a `cpjax.sweep` and writes its results to `path`, with plant, controller, settings and versions.
 
-    Each block is saved when it is done, in the folder `path` + ".parts". Killed at any moment and called again with
-    the same arguments, it goes on there and ends in the identical file; the folder is then gone. With several processes
-    (`jax.distributed`) all call this, and the first writes.
+    Each block is saved when it is done, in the folder `path` + ".parts". If the process is killed at any moment, a call
+    with the same arguments resumes there and writes the identical file; the folder is deleted at the end. With several
+    processes (`jax.distributed`) all call this, and the first writes.
 
     Args:
       path: ends in .parquet (needs pyarrow), .npz or .json. With `save_every`, the name of a folder without a suffix,
         in which the blocks of trajectories stay, each an NPZ file, beside sweep.json.
-      about: plain values to keep in the file, such as the seed of the starts.
+      starts: the initial states, as for `sweep`.
+      about: plain values to store in the file, such as the seed of the initial states.
       simulation: see `cpjax.Simulation`; `sweep` describes the other arguments too.
 
     Returns:
@@ -102,7 +103,10 @@ def record_sweep(
 
 
 def read_sweep(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The document and the columns of a file that `record_sweep` wrote: the starts, and the metrics by name.
+    """Reads a file of metrics that `record_sweep` wrote.
+
+    Returns:
+      The document, and the columns (n, ...) by name: initial states ("start." and the component) and metrics.
 
     Raises:
       InputError: no such file, or not one of `record_sweep`'s.
@@ -150,14 +154,14 @@ def _pyarrow() -> Any:
 def _described(component: Any) -> Any:
     try:
         return io.encode(component)
-    except InputError:  # a user's own, or one that holds some
+    except InputError:  # a component of the user's own, or one that holds such
         return type(component).__name__
 
 
 def _digest(work: SweepPlan) -> str:
-    """Returns a fingerprint of all that goes in."""
+    """Returns a fingerprint of all inputs of the sweep."""
     digest = hashlib.sha256()
-    # With classes, choices and functions; without addresses, which are others in each process.
+    # With classes, choices and functions; without addresses, which differ between processes.
     digest.update(re.sub(r" at 0x[0-9a-f]+", "", str(work.kind.structure)).encode())
     for leaf in work.leaves:
         array = np.ascontiguousarray(leaf)
@@ -175,7 +179,7 @@ def _columns(result: Any) -> dict[str, np.ndarray]:
     columns = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(result):
         name = jax.tree_util.keystr(path, simple=True, separator=".") or "result"
-        columns[name.removeprefix("outputs.")] = leaf  # of a trajectory, beside its other columns
+        columns[name.removeprefix("outputs.")] = leaf  # a trajectory's outputs, beside its other columns
     return columns
 
 
@@ -186,7 +190,7 @@ def _npz(columns: Mapping[str, Any]) -> bytes:
 
 
 def _assemble(path: Path, folder: Path, parts: list[Path], document: dict[str, Any], work: SweepPlan) -> Any:
-    """One file of all parts, which are then deleted."""
+    """Writes one file of all parts, deletes them, and returns the results."""
     loaded = []
     for part in parts:
         with np.load(part) as archive:

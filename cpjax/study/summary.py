@@ -1,4 +1,4 @@
-"""What the metrics of a sweep say, in a few numbers."""
+"""Summary statistics of the metrics of a sweep."""
 
 from typing import Any
 
@@ -20,10 +20,10 @@ COSTS = (
 
 
 def summarise(metrics: Metrics) -> dict[str, Any]:
-    """Success rate with its 95 % Wilson interval, and mean, median and maximum of every cost.
+    """Returns the success rate with its 95 % Wilson interval, and mean, median and maximum of every cost.
 
-    Costs are given over the successful runs, where they can be compared, and over all of them; a settling time has a
-    meaning over the successful ones alone. With no success the figures over successes are NaN.
+    Costs are given over the successful runs, where they are comparable, and over all runs; the settling time over the
+    successful ones alone. With no success the values over successes are NaN.
 
     Args:
       metrics: of a sweep, each of shape (n,).

@@ -1,4 +1,4 @@
-"""Untuned controllers: where a tuning starts, and what its result is compared with."""
+"""Untuned baseline controllers: initial points of a tuning, and references for its result."""
 
 import math
 from typing import Literal, TypeAlias, get_args
@@ -22,9 +22,11 @@ GateKind: TypeAlias = Literal["angle-rate", "lyapunov"]
 
 
 def baseline(design: DesignName, plant: CartPole, gate: GateKind = "angle-rate") -> Hybrid:
-    """Returns a controller of round, untuned numbers for a plant.
+    """Returns a controller with round, untuned parameters for a plant.
 
     Args:
+      design: how the regulator's gain is computed, "lqr" or "placement".
+      plant: the plant, which is also the swing-up law's model.
       gate: see `assemble`.
 
     Raises:
@@ -51,10 +53,13 @@ def assemble(
     """Returns a hybrid controller whose regulator and gate are computed for a plant.
 
     Args:
-      gate: "angle-rate", an `AngleRateGate`; or "lyapunov", the level 1 of the design's own s' P s, which depends on
-        the cart too: better where the cart has little room.
-      half_angle: of the gate of angle and rate [rad].
-      rate: of the same, in units of sqrt(g / l).
+      swing_up: the swing-up law.
+      inputs: weights or pole factors from which the regulator's gain is computed.
+      plant: the plant whose linear model the gain is computed on.
+      gate: "angle-rate", an `AngleRateGate`; or "lyapunov", the level set s' P s <= 1 of the design's own P, which
+        depends on the cart's state too and suits a short track better.
+      half_angle: half angle of the `AngleRateGate` [rad]; unused by "lyapunov".
+      rate: rate of the `AngleRateGate`, in units of sqrt(g / l); unused by "lyapunov".
 
     Raises:
       InputError: an unknown gate, or a plant for which the design has no gain.

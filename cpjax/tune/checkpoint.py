@@ -1,4 +1,4 @@
-"""What a tuning remembers, and its file: a tuning that is stopped at any moment goes on from there."""
+"""State of a tuning and its checkpoint file, from which a tuning interrupted at any moment resumes."""
 
 import io as buffers
 import json
@@ -18,16 +18,16 @@ Numbers = np.ndarray[Any, Any]
 
 
 class TunerState(NamedTuple):
-    """All that a tuning needs to go on: the content of its file."""
+    """State from which a tuning of r restarts with d free parameters resumes: the content of its checkpoint file."""
 
     step: int
     vectors: Numbers
-    """(r, d)."""
+    """Current free parameters (r, d)."""
     optimiser: Any
     best: Numbers
-    """(r, d)."""
+    """Free parameters with the best validation score of each restart (r, d)."""
     scores: Numbers
-    """(r,), of `best`."""
+    """Scores of `best` (r,)."""
     stale: int
     """Validations since the last improvement."""
     history: list[dict[str, Any]]
@@ -36,10 +36,12 @@ class TunerState(NamedTuple):
 
 
 def store(path: Path | None, identity: str, memory: TunerState) -> None:
-    """Writes a memory, if there is a path.
+    """Writes the state of a tuning to its checkpoint file, if there is a path.
 
     Args:
-      identity: of the tuning that it belongs to.
+      path: the file, or None to write nothing.
+      identity: fingerprint of the tuning that the state belongs to.
+      memory: the state.
     """
     if path is None:
         return
@@ -55,7 +57,12 @@ def store(path: Path | None, identity: str, memory: TunerState) -> None:
 
 
 def restore(path: Path | None, identity: str, optimiser: optax.GradientTransformation) -> TunerState | None:
-    """The memory that was stored, if any.
+    """Returns the state that `store` wrote, or None without a path or a file.
+
+    Args:
+      path: the checkpoint file, or None.
+      identity: fingerprint of the tuning that resumes.
+      optimiser: the tuning's optimiser, which gives the structure of its state.
 
     Raises:
       InputError: a file that `store` did not write, or one of another tuning.

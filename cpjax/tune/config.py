@@ -1,4 +1,4 @@
-"""How a tuning is done: budgets, batches and the curriculum."""
+"""Configuration of a tuning: budgets, batches and the curriculum."""
 
 import dataclasses
 import math
@@ -16,44 +16,45 @@ from cpjax.tune.objective import Aggregate, Goal, soft_maximum, success_weighted
 
 @dataclasses.dataclass(frozen=True)
 class TuningConfig:
-    """A tuning draws candidates, lets gradients improve the best of them, and keeps what validates best.
+    """Configuration of a tuning: screen candidates, improve the best by gradients, keep the best in validation.
 
     Attributes:
-      starts: the set that starts are drawn from.
-      seed: of everything random. Starts of a tuning are never those that a seed names for `cpjax.sample_starts`.
+      starts: name of the set from which initial states are drawn.
+      seed: of all random numbers. No seed below 2**32 draws the same initial states by `cpjax.sample_starts`.
       goal: the weights of the objective.
       candidates: random controllers beside the given one; 0 tunes the given one alone.
-      screening: starts by which candidates are compared at first, on values alone; the better quarter each time on four
-        times as many.
-      restarts: how many of the best are tuned, the given one among them.
-      batch: starts of each step.
-      resample: steps after which these are drawn anew; 0 to keep the first ones.
+      screening: initial states of the first comparison of candidates, by values alone; the better quarter is compared
+        again on four times as many, and so on.
+      restarts: number of the best candidates that are tuned, the given controller among them.
+      batch: initial states of each step.
+      resample: steps between draws of a new batch; 0 keeps the first batch.
       steps: of the optimiser.
-      explore: after each validation the worse half of the restarts goes on from the better half, with so much noise on
-        the unconstrained parameters, less and less towards the end; 0 to let all of them be.
-      learning_rate: Adam's, at first; it falls to a twentieth along a cosine.
+      explore: standard deviation of the noise on the unconstrained parameters when, after each validation, the worse
+        half of the restarts is restarted from the better half; falls linearly to zero. 0 restarts none.
+      learning_rate: initial learning rate of Adam; it falls to a twentieth along a cosine.
       duration: of the tuning's rollouts [s].
       dt: their step [s].
-      spare_rate: steps beyond those, for crossings, in each second [1/s]; what a run leaves undone is lost.
-      first_width: the target's at first [rad and m].
-      last_width: and after six tenths of the steps, reached geometrically.
-      aggregate: what makes one number of a batch: the mean over a `tail`, a soft maximum or a success-weighted mean.
-      tail: share of the worst starts that the mean is taken over; 1 for all.
+      spare_rate: additional steps per second, for located crossings [1/s]; a run that needs more is stopped.
+      first_width: initial width of the target [rad and m].
+      last_width: width of the target from 60 % of the steps on, reached geometrically [rad and m].
+      aggregate: how a batch's values become one number: mean over a `tail`, soft maximum or success-weighted mean.
+      tail: share of the worst initial states that the mean is taken over; 1 for all.
       temperature: of a soft maximum or a success-weighted mean [s].
       threshold: of a success-weighted mean [s].
-      clip: a start's gradient is shortened to this many times the batch's median norm.
-      validate_every: steps between validations, each of which may be the last kept.
-      validation: starts of a validation, the same ones each time.
-      patience: validations without a better result after which a tuning ends; 0 for never.
-      finalists: of the restarts' best, compared on `final` starts, so many are compared once more at the final step.
-      final: starts of either comparison.
-      final_horizon: of its runs [s].
+      clip: each initial state's gradient is norm-clipped to this many times the batch's median norm.
+      validate_every: steps between validations; the checkpoint is written after each.
+      validation: initial states of a validation, the same each time.
+      patience: validations without improvement after which a tuning ends; 0 for never.
+      finalists: number of restarts that, after a comparison of all on `final` initial states, are compared once more
+        with `final_horizon` and `final_dt`.
+      final: initial states of each of these two comparisons.
+      final_horizon: duration of the last comparison's runs [s].
       final_dt: their step and control period [s].
-      horizon: of screening and validation [s].
+      horizon: duration of the runs of all other comparisons: screening, validation and the last but one [s].
       horizon_dt: their step and control period [s].
-      pole_limit: bound on the fastest pole of the linear closed loop [1/s].
-      plant_spread: every parameter of the plant is drawn within this share of its value, for each start; the law's
-        model is not.
+      pole_limit: bound on the magnitude of the fastest pole of the linear closed loop [1/s].
+      plant_spread: every uncertain parameter of the plant is drawn within this share of its value, for each initial
+        state; the law's model is not.
     """
 
     starts: str = "hanging"
@@ -102,36 +103,37 @@ class TuningConfig:
             raise InputError("restarts", self.restarts, f"at most candidates + 1, {self.candidates + 1}")
 
     def aggregated(self, values: jax.Array) -> jax.Array:
-        """One number of the values of a batch (n,)."""
+        """Returns one number () for the objective's values of a batch (n,)."""
         return _AGGREGATES[self.aggregate](self)(values)
 
     @property
     def spare_steps(self) -> int:
-        """Of a rollout with located switching, for crossings."""
+        """Additional steps of a rollout with located switching, for crossings."""
         return math.ceil(self.spare_rate * self.duration)
 
     def width(self, step: int) -> float:
-        """The target's at a step [rad and m]."""
+        """Returns the width of the target at a step of the optimiser [rad and m]."""
         done = min(1.0, step / max(1.0, 0.6 * self.steps))
         return float(self.first_width * (self.last_width / self.first_width) ** done)
 
     def table(self) -> dict[str, Any]:
-        """As plain values."""
+        """Returns the configuration as plain values."""
         return dataclasses.asdict(self)
 
 
 def check_plan(
     plan: Any, counts: Mapping[str, int], numbers: Mapping[str, Number], steps: Sequence[tuple[str, str]]
 ) -> None:
-    """Normalises a frozen plan's numbers; what its fields may be.
+    """Checks the fields of a frozen config and normalises its real numbers in place.
 
     Args:
-      counts: names of whole numbers, and the least that each may be.
-      numbers: names of real ones, and their rules.
-      steps: pairs of a duration's name and that of the step which divides it.
+      plan: the config, a frozen dataclass.
+      counts: names of integer fields, with the least value of each.
+      numbers: names of real fields, with their rules.
+      steps: pairs of a duration's name and the name of the step that must divide it.
 
     Raises:
-      InputError: names the field.
+      InputError: a field outside its range, named.
     """
     for name, least in counts.items():
         value = getattr(plan, name)
@@ -148,7 +150,7 @@ def check_plan(
             raise InputError(field, getattr(plan, field), problem.allowed) from problem
 
 
-_MOST = 10_000_000  # of whatever is counted: more would not fit a memory
+_MOST = 10_000_000  # upper bound of every count but the seed: more would not fit in memory
 
 _AGGREGATES: Mapping[str, Callable[[TuningConfig], Aggregate]] = {
     "tail": lambda plan: tail_mean(plan.tail),
@@ -156,7 +158,7 @@ _AGGREGATES: Mapping[str, Callable[[TuningConfig], Aggregate]] = {
     "success-weighted": lambda plan: success_weighted(plan.threshold, plan.temperature),
 }
 AGGREGATES = tuple(_AGGREGATES)
-"""Names that a `TuningConfig` knows."""
+"""Values that `TuningConfig.aggregate` may have."""
 
 _COUNTS = {
     "seed": 0,

@@ -1,4 +1,4 @@
-"""What every tuning of many controllers side by side does: steps, blocks, and starts of its own."""
+"""Parts shared by all tunings of many controllers at once: optimiser steps, evaluation in blocks, derived seeds."""
 
 import operator
 from typing import Any
@@ -10,7 +10,14 @@ import optax
 
 
 def step(optimiser: optax.GradientTransformation, vectors: jax.Array, state: Any, slope: jax.Array) -> Any:
-    """Vectors (n, d) and the optimiser's memory after a step; what would become infinite or NaN stays."""
+    """Returns the vectors and the optimiser's state after a step; elements that would not be finite do not move.
+
+    Args:
+      optimiser: an optax transformation.
+      vectors: free parameters (n, d).
+      state: the optimiser's state.
+      slope: gradients (n, d).
+    """
     with jax.numpy_dtype_promotion("standard"):  # optax's own arithmetic mixes dtypes
         change, state = optimiser.update(slope, state)
         moved = optax.apply_updates(vectors, change)
@@ -18,7 +25,13 @@ def step(optimiser: optax.GradientTransformation, vectors: jax.Array, state: Any
 
 
 def clip_factors(slopes: jax.Array, sound: jax.Array, clip: float) -> jax.Array:
-    """Factors (n,) that bring each gradient of (n, d) down to `clip` times the median norm of those that are sound."""
+    """Returns factors (n,) that scale each gradient down to at most `clip` times the median norm of the sound ones.
+
+    Args:
+      slopes: gradients (n, d), finite.
+      sound: which gradients count for the median (n,), bool.
+      clip: largest norm, relative to the median [1].
+    """
     norms = jnp.sqrt(jnp.sum(slopes * slopes, axis=1))
     median = jnp.nan_to_num(jnp.nanmedian(jnp.where(sound, norms, jnp.nan)))
     tiny = float(np.finfo(norms.dtype).tiny)
@@ -26,7 +39,16 @@ def clip_factors(slopes: jax.Array, sound: jax.Array, clip: float) -> jax.Array:
 
 
 def in_blocks(function: Any, block: int, *trees: Any) -> Any:
-    """`function` of (n, ...) arrays, as NumPy arrays, by blocks of one size, so that it is compiled once."""
+    """Applies a batched function block by block, so that it is compiled for one batch size only.
+
+    Args:
+      function: maps trees of arrays (block, ...) to a tree of arrays (block, ...).
+      block: batch size; the last block is padded with copies of the last element.
+      trees: the arguments, trees of arrays (n, ...).
+
+    Returns:
+      The results as NumPy arrays (n, ...).
+    """
     count = jax.tree.leaves(trees)[0].shape[0]
     parts = []
     for begin in range(0, count, block):
@@ -36,5 +58,11 @@ def in_blocks(function: Any, block: int, *trees: Any) -> Any:
 
 
 def derive_seed(seed: int, purpose: int, number: int) -> int:
-    """A seed that no person types in: of starts that no evaluation uses."""
+    """Derives a seed of at least 2**32, so that tuning does not reuse the initial states of an evaluation.
+
+    Args:
+      seed: the configuration's seed.
+      purpose: what the random numbers are for.
+      number: distinguishes seeds of one purpose, such as the step.
+    """
     return 2**32 + int(np.random.SeedSequence([seed, purpose, number]).generate_state(1)[0])

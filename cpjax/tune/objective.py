@@ -1,7 +1,7 @@
-"""What a tuning minimises: folds over a rollout, weighed and added, and what makes one number of many starts.
+"""Objectives of a tuning: metrics of a rollout, their weighted sum, and aggregates over many initial states.
 
-Every term is smooth in the trajectory, or has a kink at most, and is bounded or grows slowly, so that one bad start
-cannot drown the others.
+Every term is smooth in the trajectory or has kinks at most, and is bounded or grows slowly, so that one bad initial
+state does not dominate the others.
 """
 
 import math
@@ -20,7 +20,7 @@ from cpjax.sim.metrics import Fold, Sample, TimeOutside
 
 
 class _Integral:
-    """The integral over time of `rate(sample)`, by the trapezoidal rule."""
+    """Metric that integrates `rate(state, voltage)` over time, by the trapezoidal rule."""
 
     def rate(self, state: State, voltage: jax.Array) -> jax.Array:
         raise NotImplementedError
@@ -39,7 +39,7 @@ class _Integral:
 
 @pytree
 class Effort(_Integral):
-    """The integral of u^2 dt [V^2 s]."""
+    """Metric: the integral of u^2 dt [V^2 s]."""
 
     def rate(self, state: State, voltage: jax.Array) -> jax.Array:
         return voltage * voltage
@@ -47,7 +47,7 @@ class Effort(_Integral):
 
 @pytree
 class TrackExcess(_Integral):
-    """A soft track limit: the time spent beyond it, in proportion to how far, but at most 1 per second [s].
+    """Soft track limit: time spent near or beyond it, weighted from 0 to 1 by the excess [s].
 
     The integral of 1 - exp(-(max(|x| - limit + margin, 0) / margin)^2 / 2).
     """
@@ -62,13 +62,13 @@ class TrackExcess(_Integral):
 
 @pytree
 class EnergyError(_Integral):
-    """The time spent with the wrong energy [s]: a cost that has a slope where no catch is in sight.
+    """Time spent with the wrong pendulum energy [s]: a cost with a nonzero gradient even where no catch is near.
 
-    The integral of 1 - exp(-(E / width)^2 / 2), with E the pendulum's energy, zero upright at rest, in units of what it
-    takes to lift it from hanging.
+    The integral of 1 - exp(-(E / width)^2 / 2), with E the pendulum's energy, zero upright at rest, in units of
+    2 m g l, which lifts it from hanging to upright.
     """
 
-    plant: CartPole = part("whose pendulum, a CartPole", "pendulum_energy")
+    plant: CartPole = part("plant whose pendulum energy counts, a CartPole", "pendulum_energy")
     width: Scalar = number("1", "of the target", default=0.5, above=0.0)
 
     def rate(self, state: State, voltage: jax.Array) -> jax.Array:
@@ -79,7 +79,7 @@ class EnergyError(_Integral):
 
 @pytree
 class VoltageVariation:
-    """The total variation of the applied voltage, its corners rounded [V]: a step of `rounding` counts about a half."""
+    """Smoothed total variation of the applied voltage [V]: a change d counts sqrt(d^2 + rounding^2) - rounding."""
 
     rounding: Scalar = number("V", "changes far smaller than this count little", default=0.1, above=0.0)
 
@@ -101,7 +101,7 @@ class VoltageVariation:
 
 @pytree
 class TerminalCost:
-    """How far from upright in place the run ends, between 0 and 1; the widths are those of `TimeOutside`."""
+    """Deviation from upright at x = 0 when the run ends, between 0 and 1; the widths are those of `TimeOutside`."""
 
     angle_width: Scalar = number("rad", "of the target", default=0.2, above=0.0)
     position_width: Scalar = number("m", "of the target", default=0.2, above=0.0)
@@ -121,7 +121,7 @@ class TerminalCost:
 
 @pytree
 class RemainingTime:
-    """The time that a stopped run left undone [s]: counted as badly spent, so that being stopped gains nothing."""
+    """Time lost when a run is stopped early [s]: a cost, so that stopping is no advantage."""
 
     duration: Scalar = number("s", "of the whole run", above=0.0)
 
@@ -137,7 +137,7 @@ class RemainingTime:
 
 @pytree
 class Travel:
-    """max |x| [m]."""
+    """Cart travel max |x| [m]."""
 
     def init(self, sample: Sample) -> jax.Array:
         return jnp.zeros_like(sample.time)
@@ -150,7 +150,7 @@ class Travel:
 
 
 class _Several:
-    """Several folds at once."""
+    """Several metrics computed together."""
 
     terms: tuple[Any, ...]
 
@@ -166,7 +166,7 @@ class _Several:
 
 @pytree
 class WeightedSum(_Several):
-    """The sum of several folds' results, each times its weight."""
+    """Weighted sum of the results of several metrics."""
 
     terms: tuple[Any, ...]
     weights: tuple[Scalar, ...]
@@ -180,17 +180,18 @@ class WeightedSum(_Several):
 
 @pytree
 class Lagrangian(_Several):
-    """The time outside the target with every cost at its price [s]; and the costs themselves.
+    """Lagrangian of the time outside the target under bounds on the mean costs [s]; and the costs themselves.
 
-    That is time + unfinished (1 + fine) + sum(price cost): the Lagrangian of a time that is minimised under bounds on
-    the costs' means, for multipliers `prices`.
+    The Lagrangian is time + remaining (1 + fine) + sum(price cost), with multipliers `prices` and the time `remaining`
+    when the run is stopped early.
     """
 
     terms: tuple[Any, ...]
-    """The time, the costs, and the time that a stopped run left undone."""
+    """Metrics: the time outside the target, the costs, and the remaining time of a stopped run."""
     prices: tuple[Any, ...]
-    """Of a unit of each cost [s]."""
+    """Multiplier of each cost [s per unit of the cost]."""
     fine: Any
+    """Extra weight of each second lost when a run stops early [1]."""
 
     def finish(self, memory: tuple[Any, ...], last: Sample) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         time, *costs, undone = self._results(memory, last)
@@ -202,7 +203,7 @@ class Lagrangian(_Several):
 
 @pytree
 class Goal:
-    """The weights of an objective. What has no weight is not computed; all together are to be read as seconds."""
+    """Weights of the objective, whose unit is the second. Terms of weight 0 are not computed."""
 
     time: Scalar = number("1", "of the time outside the target", default=1.0, at_least=0.0)
     effort: Scalar = number("s/(V^2 s)", "of the integral of u^2", default=0.0, at_least=0.0)
@@ -219,10 +220,15 @@ class Goal:
             raise InputError("Goal", self, "with at least one weight above 0")
 
     def fold(self, plant: CartPole, width: Scalar, duration: float) -> Fold:
-        """The objective of runs of this duration [s], with a target of this width [rad and m].
+        """Returns the metric that computes the objective of one run [s].
 
-        Where a run is stopped, by a flag, the rest of it counts as outside the target, beyond the track, at the wrong
-        energy and at full voltage.
+        The time that remains when a flag stops a run counts as outside the target, beyond the track, at the wrong
+        energy and, if the voltage limit is finite, at full voltage.
+
+        Args:
+          plant: the pendulum whose energy counts, and the voltage limit.
+          width: of the target [rad and m].
+          duration: of the whole run [s].
         """
         limit, supply = float(self.track_limit), float(plant.motor.voltage_limit)
         makers: Mapping[str, Callable[[], Fold]] = {
@@ -241,16 +247,21 @@ class Goal:
 
 
 WEIGHTS = ("time", "effort", "track", "jerkiness", "energy", "terminal")
-"""The weights that a `Goal` has."""
+"""Names of the weights of a `Goal`."""
 
 
 Aggregate: TypeAlias = Callable[[jax.Array], jax.Array]
-"""One number of the values of many starts (n,). Its derivative says how much each start's gradient counts."""
+"""Reduces the values of n initial states (n,) to one number (); its derivative is the weight of each gradient."""
 
 
 def tail_mean(share: float) -> Aggregate:
-    """The mean of the worst `share` of the starts (1: of all): the conditional value at risk (Rockafellar and Uryasev,
-    2000).
+    """Returns the aggregate that averages the worst values: conditional value at risk (Rockafellar and Uryasev, 2000).
+
+    Args:
+      share: of the initial states; 1 for all [1].
+
+    Raises:
+      InputError: a share that is not above 0 and at most 1.
     """
     _check_share("share", share)
 
@@ -262,7 +273,14 @@ def tail_mean(share: float) -> Aggregate:
 
 
 def soft_maximum(temperature: float) -> Aggregate:
-    """T log mean exp(value / T): the mean for a large temperature T, the maximum for a small one."""
+    """Returns the aggregate T log mean exp(value / T): the mean for a large T, the maximum for a small one.
+
+    Args:
+      temperature: T, in the unit of the values [s].
+
+    Raises:
+      InputError: a temperature that is not finite and above 0.
+    """
     if isinstance(temperature, (bool, str)) or not 0.0 < temperature < math.inf:
         raise InputError("temperature", temperature, "a finite number above 0")
 
@@ -274,9 +292,16 @@ def soft_maximum(temperature: float) -> Aggregate:
 
 
 def success_weighted(threshold: float, temperature: float) -> Aggregate:
-    """The mean over the starts that are well, each weighed by 1 / (1 + exp((value - threshold) / temperature)).
+    """Returns the aggregate that is the mean weighted by 1 / (1 + exp((value - threshold) / temperature)).
 
-    The weights are part of the value: a start that gets worse beyond the threshold counts less and less.
+    The weights are differentiated too: an initial state counts less the farther its value is above the threshold.
+
+    Args:
+      threshold: value at which the weight is 1/2 [s].
+      temperature: difference of values over which the weight falls [s].
+
+    Raises:
+      InputError: a temperature that is not finite and above 0.
     """
     if isinstance(temperature, (bool, str)) or not 0.0 < temperature < math.inf:
         raise InputError("temperature", temperature, "a finite number above 0")

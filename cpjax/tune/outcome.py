@@ -1,4 +1,4 @@
-"""What a tuning was asked for, and what it found."""
+"""Request and result of a tuning."""
 
 import dataclasses
 from typing import Any
@@ -17,21 +17,21 @@ Numbers = np.ndarray[Any, Any]
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """What `tune` found.
+    """Result of `tune`.
 
     Attributes:
-      controller: the best one.
+      controller: the best controller.
       vector: its free parameters, unconstrained (d,).
-      labels: their names.
-      physical: and themselves, in SI units.
-      score: by which it was chosen: mean settling time [s], a failure counting three horizons; weighed as in the goal,
-        with its effort and jerkiness.
-      success_rate: on the starts of the last comparison.
-      settling_time: mean over the successes among them [s].
+      labels: names of the free parameters (d,).
+      physical: values of the free parameters in SI units (d,).
+      score: mean over the last comparison's initial states of the settling time, with 30 horizons for a failure, of the
+        effort and of the voltage variation, weighted as in the goal [s].
+      success_rate: on the initial states of the last comparison.
+      settling_time: mean over the successes among them [s]; NaN if there is none.
       history: one record per validation.
       value_steps: RK4 steps simulated for values alone.
-      gradient_steps: and with a gradient, iterations spent on crossings included.
-      seconds: of this process, compilation included.
+      gradient_steps: RK4 steps simulated with a gradient, those for crossings included.
+      seconds: wall time of the call that finished the tuning, compilation included [s].
     """
 
     controller: Hybrid
@@ -48,7 +48,7 @@ class Tuning:
 
 
 def request(plant: CartPole, free: FreeParameters, plan: TuningConfig) -> dict[str, Any]:
-    """What a tuning depends on, as plain values: two of the same request end in the same bits on one machine."""
+    """Returns all that a tuning depends on, as plain values: equal requests give equal bits on one machine."""
     return {
         "versions": io.versions(),
         "plan": plan.table(),
@@ -59,7 +59,7 @@ def request(plant: CartPole, free: FreeParameters, plan: TuningConfig) -> dict[s
 
 
 def document(tuning: Tuning, plant: CartPole, free: FreeParameters, plan: TuningConfig) -> dict[str, Any]:
-    """The result for programs; its controller is also a file of its own."""
+    """Returns request and result as plain values, for JSON; the success rate with its 95 % Wilson interval."""
     fields = {f.name: getattr(tuning, f.name) for f in dataclasses.fields(tuning) if f.name != "controller"}
     low, high = wilson_interval(round(tuning.success_rate * plan.final), plan.final)
     return {

@@ -1,8 +1,8 @@
-"""The free parameters of a hybrid controller, as numbers that an optimiser may move anywhere.
+"""Free parameters of a hybrid controller, as an unconstrained vector for an optimiser.
 
-Positive parameters are moved by their logarithm, those between two ends by a logit, others as they are. A regulator is
-always the one that its design gives for the swing-up law's model of the plant: gradients pass through Riccati's
-equation, or through the placement.
+Positive parameters enter by their logarithm, those between two bounds by a logit, others as they are. The regulator's
+gain is always computed by its design for the swing-up law's model of the plant: gradients pass through the Riccati
+equation, or through the pole placement.
 """
 
 import dataclasses
@@ -20,35 +20,35 @@ from cpjax.plant import CartPole, linearize
 from cpjax.pytree import Number, rules
 
 Vector: TypeAlias = jax.Array
-"""Shape (d,), unconstrained."""
+"""Unconstrained parameters (d,)."""
 
 FROZEN = ("R", "hysteresis", "kick", "kick_radius")
-"""Not free unless asked for: K depends on Q / R alone, and the others are small corrections."""
+"""Names that are not free by default: K depends on Q / R alone, and the others are small corrections."""
 
 _LEAST = 1e-3
-"""What a parameter that is zero starts at, in its natural unit: a logarithm knows no zero."""
+"""Initial value of a parameter that is zero, in its natural unit: the logarithm of zero is not finite."""
 
 
 class _Slot(NamedTuple):
-    """Where a parameter stands in the vector, and how it is made."""
+    """Position of a parameter in the vector, and its transformation."""
 
     name: str
     part: str
-    """swing_up, design or gate."""
+    """Part of the controller: swing_up, design or gate."""
     kind: str
-    """log, logit, plain, or full: a Cholesky factor."""
+    """Transformation: log, logit, plain, or full (a Cholesky factor)."""
     begin: int
     size: int
     low: float
     high: float
-    """Ends of the range that random restarts are drawn from."""
+    """`low` and `high` bound the range from which `draw` draws the parameter."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FreeParameters:
-    """Which numbers of `controller` are free; makes controllers of vectors and vectors of controllers.
+    """Free parameters of `controller`, and the maps between an unconstrained vector (d,) and a controller.
 
-    Make it with `free_parameters`.
+    Built by `free_parameters`.
     """
 
     controller: Hybrid
@@ -56,18 +56,18 @@ class FreeParameters:
 
     @property
     def model(self) -> CartPole:
-        """The swing-up law's own idea of the plant, for which the regulator is designed."""
+        """Plant model used by the swing-up law, for which the regulator is designed."""
         return _law(self.controller).model
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A name for each element of a physical vector, such as "Q[0]"."""
+        """Name of each element of a physical vector (d,), such as "Q[0]"."""
         return tuple(
             slot.name if slot.size == 1 else f"{slot.name}[{i}]" for slot in self.slots for i in range(slot.size)
         )
 
     def start(self) -> Vector:
-        """The vector of `controller` itself (d,); zeros become small numbers where a logarithm is taken."""
+        """Returns the vector (d,) of `controller` itself; zeros become small numbers where a logarithm is taken."""
         parts = []
         for slot in self.slots:
             value = np.asarray(_read(self.controller, slot), dtype=np.float64).reshape(-1)
@@ -84,12 +84,12 @@ class FreeParameters:
         return jnp.asarray(np.concatenate(parts), dtype=jnp.result_type(float))
 
     def physical(self, vector: Vector) -> Vector:
-        """The parameters themselves, in SI units (d,); of a full Q the rows of its lower triangle."""
+        """Returns the parameters (d,) of a vector (d,) in SI units; for a full Q the rows of its lower triangle."""
         values = (self._value(slot, vector) for slot in self.slots)
         return jnp.concatenate([v if v.ndim == 1 else v[jnp.tril_indices(4)] for v in values])
 
     def build(self, vector: Vector) -> Hybrid:
-        """The controller of a vector. Differentiable, under jit and vmap too."""
+        """Returns the controller of a vector (d,). Differentiable, also under jit and vmap."""
         given: dict[str, dict[str, Any]] = {"swing_up": {}, "design": {}, "gate": {}}
         for slot in self.slots:
             value = self._value(slot, vector)
@@ -109,10 +109,12 @@ class FreeParameters:
         return Hybrid(swing_up, regulator, gate)
 
     def draw(self, random: np.random.Generator, count: int, *, short_track: bool = False) -> np.ndarray[Any, Any]:
-        """`count` vectors (count, d) from the ranges of random restarts, uniform in logarithm or, an angle, as is.
+        """Draws random vectors (count, d) from the slots' ranges, uniform in the logarithm, or in the angle itself.
 
         Args:
-          short_track: energy gains down to a fifth too: who has little room pumps gently, in more swings.
+          random: generator of the random numbers.
+          count: number of vectors.
+          short_track: extend the energy gains' range down to a fifth: a short track needs lower gains and more swings.
         """
         columns = []
         for slot in self.slots:
@@ -146,8 +148,8 @@ class FreeParameters:
         return _full(x) if slot.kind == "full" else x
 
     def _ends(self, slot: _Slot, hysteresis: Any) -> tuple[float, Any]:
-        """Between what a parameter with two ends lies."""
-        if slot.name == "half_angle":  # the way out must not be wider than a half turn
+        """Returns the bounds of a parameter with a logit."""
+        if slot.name == "half_angle":  # the exit region must not exceed pi on either side
             return 0.0, math.pi / (1.0 + hysteresis)
         rule = rules(EnergySwingUp)[slot.name]
         assert isinstance(rule, Number)
@@ -157,17 +159,17 @@ class FreeParameters:
 def free_parameters(
     controller: Hybrid, free: Sequence[str] | None = None, *, frozen: Sequence[str] = (), full_q: bool = False
 ) -> FreeParameters:
-    """The free parameters of a hybrid controller with an energy law and a regulator that knows its design.
+    """Returns the free parameters of a hybrid controller with an energy law and a regulator with a design.
 
     Args:
-      controller: an `EnergySwingUp`, a `StateFeedback` with its `design`, and any gate.
+      controller: a `Hybrid` of an `EnergySwingUp`, a `StateFeedback` with its `design`, and any gate.
       free: names such as "energy_gain", "Q", "a", "half_angle"; by default all but `FROZEN`.
-      frozen: names to take out again.
-      full_q: a full state weight instead of a diagonal one.
+      frozen: names that are not free even if in `free`.
+      full_q: whether the free Q is full instead of diagonal.
 
     Raises:
-      InputError: another kind of controller, a name that it does not have, or `full_q` where no Q is free, or a Q that
-        is not diagonal without it.
+      InputError: another kind of controller, a name that it does not have, no name left, `full_q` where no Q is free,
+        or a free Q that is not diagonal without `full_q`.
     """
     if not isinstance(controller, Hybrid) or not isinstance(controller.swing_up, EnergySwingUp):
         raise InputError("controller", controller, "a cpjax.Hybrid with a cpjax.EnergySwingUp")
@@ -208,16 +210,16 @@ def free_parameters(
 
 
 class _Natural(NamedTuple):
-    """Units that the plant itself suggests, for ranges that fit any rig."""
+    """Natural units of the plant, for ranges that suit any rig."""
 
     rate: float
-    """sqrt(m g l / J): of the small oscillation about hanging [1/s]."""
+    """Angular frequency of small oscillations about hanging, sqrt(m g l / J), J about the pivot [1/s]."""
     energy_gain: float
-    """The full acceleration over energy and rate of a pendulum that has to be swung up [m/(J s)]."""
+    """Cart acceleration at full voltage over 4 m g l times `rate`: over energy times rate of a swing-up [m/(J s)]."""
     weights: tuple[float, ...]
-    """Q / R that make the full voltage of one length, or of one radian."""
+    """Diagonal of Q / R at which one pole length or one radian (of a rate, times `rate`) costs as full voltage does."""
     level: float
-    """What it costs to come back, in the unit of the design's s' P s."""
+    """Typical cost of a return to upright, in the unit of the design's s' P s."""
 
 
 def _natural(controller: Hybrid) -> _Natural:
@@ -236,7 +238,7 @@ def _natural(controller: Hybrid) -> _Natural:
 
 
 def _ranges(controller: Hybrid) -> Mapping[str, tuple[float, float]]:
-    """Of random restarts, in SI units; of Q in natural units."""
+    """Returns the ranges from which parameters are drawn, in SI units; of Q in natural units."""
     natural = _natural(controller)
     w = natural.rate
     return {
@@ -258,7 +260,7 @@ def _ranges(controller: Hybrid) -> Mapping[str, tuple[float, float]]:
 
 def _law(controller: Hybrid) -> EnergySwingUp:
     law = controller.swing_up
-    assert isinstance(law, EnergySwingUp)  # `free_parameters` saw to it
+    assert isinstance(law, EnergySwingUp)  # checked by `free_parameters`
     return law
 
 
@@ -270,12 +272,12 @@ def _weights(controller: Hybrid) -> LqrWeights:
 
 
 def _scales(controller: Hybrid) -> np.ndarray[Any, Any]:
-    """What the elements of Q's diagonal are measured by (4,)."""
+    """Returns the natural units of the elements of Q's diagonal (4,)."""
     return np.asarray(_natural(controller).weights) * float(_weights(controller).R)
 
 
 def _first(controller: Hybrid, name: str) -> float:
-    """The gate's own value of a parameter, 0 where it has none."""
+    """Returns the gate's own value of a parameter, 0 where it has none."""
     return float(getattr(controller.gate, name, 0.0))
 
 
@@ -291,14 +293,14 @@ _BELOW = np.tril_indices(4, -1)
 
 
 def _full(x: jax.Array) -> jax.Array:
-    """Q (4, 4) = D U U' D of x (10,): D's diagonal exp(x[:4]), U lower triangular with ones, x[4:] below them."""
+    """Returns Q = D U U' D (4, 4) of x (10,): D diagonal, exp(x[:4]); U unit lower triangular, x[4:] below ones."""
     U = jnp.eye(4, dtype=x.dtype).at[_BELOW].set(x[4:])
     L = jnp.exp(x[:4])[:, None] * U
     return L @ L.T
 
 
 def _from_full(Q: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """The x of which `_full` makes Q; a singular Q is lifted a little."""
+    """Returns the x (10,) from which `_full` builds Q; a nearly singular Q gets a small multiple of I added."""
     floor = _LEAST**2 * np.max(np.diagonal(Q))
     L = np.linalg.cholesky(Q + floor * np.eye(4)) if np.min(np.linalg.eigvalsh(Q)) < floor else np.linalg.cholesky(Q)
     D = np.diagonal(L)

@@ -1,4 +1,4 @@
-"""Plants about a plant: for robustness, and for tuning over it."""
+"""Random plants around a nominal plant: to check robustness, and to tune over uncertain parameters."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from cpjax.plant import CartPole, Motor, parameter, parameters_of, with_paramete
 from cpjax.pytree import Number, numbers
 
 UNCERTAIN = tuple(name for name, rule in numbers(CartPole, Motor).items() if rule.uncertain)
-"""Parameters that a rig's owner does not know well. Gravity and the supply are known."""
+"""Names of the uncertain parameters of a cart-pole and its motor. Others, such as gravity, count as known."""
 
 _DRAWN_TOGETHER = (
     "cart_mass",
@@ -21,25 +21,30 @@ _DRAWN_TOGETHER = (
     "back_emf_constant",
     "resistance",
 )
-# A seed names the same values of these whatever other parameters there are: they share one table of random numbers,
-# and every other parameter has a stream of its own. Nothing is to be added here.
+# For a given seed the values of these do not depend on which other parameters exist: they share one table of random
+# numbers, and every other parameter has a stream of its own. Do not add names here: that would change the values.
 
 
 def sample_plants(plant: CartPole, count: int, *, spread: float, seed: int, only: str | None = None) -> CartPole:
-    """`count` plants whose parameters are `plant`'s times a factor uniform in 1 - spread .. 1 + spread.
+    """Draws plants whose uncertain parameters are `plant`'s times a factor uniform in 1 - spread .. 1 + spread.
 
-    A share of nothing is nothing: a parameter that is zero is drawn between 0 and `spread` times the size declared with
-    it; of the cart's friction that is `motor.damping`, of the pivot's a fifth of the pendulum's critical damping,
-    0.4 sqrt(m g l J). What would leave the parameter's range is put on its end.
+    A parameter that is zero is drawn between 0 and `spread` times the size declared with it: for the cart's friction
+    `motor.damping`, for the pivot's a fifth of the pendulum's critical damping, 0.4 sqrt(m g l J). Values are clipped
+    to the parameter's range.
 
     Args:
+      plant: the nominal plant, of scalar parameters.
+      count: number of plants.
+      spread: largest relative deviation [1].
+      seed: of the random numbers.
       only: the one parameter that is drawn; by default all that are declared uncertain, such as those of `UNCERTAIN`.
 
     Returns:
-      A CartPole of arrays (count,), to be mapped over.
+      A CartPole of arrays (count,), for `jax.vmap`.
 
     Raises:
-      InputError: a count below 1, a spread outside 0 to below 1, a negative seed, or another parameter.
+      InputError: a count below 1, a spread that is negative or not below 1, a negative seed, or an `only` that is not
+        an uncertain parameter.
     """
     Number("1", "spread", at_least=0.0, below=1.0).normalise("spread", spread)
     for field, value, least in (("count", count, 1), ("seed", seed, 0)):

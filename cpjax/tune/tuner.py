@@ -1,8 +1,8 @@
 """The tuner: random candidates, gradients through whole swing-ups for the best of them, and a choice by values.
 
-A gradient knows how a swing-up changes while it stays the same kind of swing-up. It does not know that a little farther
-on a catch fails and the pendulum goes round again. Values know that, and they are cheap. So values choose where to
-start and what to keep, and gradients do the work in between.
+A gradient describes how a swing-up changes while its sequence of swings and switches stays the same. It does not show
+that a little farther on the catch fails and the pendulum makes another turn. Values show that and cost less. So values
+select the initial controllers and the result, and gradients improve the controllers in between.
 """
 
 import functools
@@ -35,9 +35,9 @@ from cpjax.tune.plants import sample_plants
 Numbers = np.ndarray[Any, Any]
 Report = Callable[[int, int, str], None]
 
-_FAILURE = 30.0  # what a start that fails counts, in horizons: success first, then time
-_SCREEN, _STEP, _VALIDATE, _SEMIFINAL, _FINAL, _CANDIDATES, _NOISE = range(7)  # what random numbers are for
-_BLOCK, _CONTROLLERS = 512, 64  # lanes that are simulated, and controllers that are designed, at once
+_FAILURE = 30.0  # settling time that a failed run counts as, in horizons: success comes before time
+_SCREEN, _STEP, _VALIDATE, _SEMIFINAL, _FINAL, _CANDIDATES, _NOISE = range(7)  # purposes of random numbers
+_BLOCK, _CONTROLLERS = 512, 64  # batch sizes: runs simulated, and controllers designed, at once
 
 
 def tune(
@@ -51,10 +51,12 @@ def tune(
     """Tunes the free parameters on `plant`.
 
     Args:
-      free: what may change, and the controller to begin with.
+      plant: the plant on which controllers are run.
+      free: the free parameters, and the initial controller.
+      plan: the configuration.
       progress: called with the steps done, their number, and loss and success rate in words.
-      checkpoint: a file that is written after each validation. A tuning that finds it goes on from there, and ends in
-        the same bits as one that was never stopped.
+      checkpoint: a file that is written after each validation. A tuning resumes from it if it exists, and its result
+        is bitwise that of an uninterrupted one.
 
     Raises:
       InputError: a checkpoint of another tuning, or a controller that this plant cannot run.
@@ -81,7 +83,7 @@ def tune(
 
 
 class _Tuner:
-    """The compiled pieces."""
+    """Compiled functions of one tuning, and the steps that use them."""
 
     def __init__(self, plant: CartPole, free: FreeParameters, plan: TuningConfig) -> None:
         self.plant, self.free, self.plan = plant, free, plan
@@ -99,7 +101,7 @@ class _Tuner:
         self.identity = io.dump_json(request(plant, free, plan))
 
     def _runs(self, **settings: Any) -> Any:
-        """Metrics of controllers (n,) from starts (n,), each on the plant or on one of its own."""
+        """Returns a compiled map from controllers, initial states and plants (or None), each (n,), to metrics (n,)."""
         return jax.jit(jax.vmap(functools.partial(self._run, **settings)))
 
     def begin(self) -> TunerState:
@@ -124,7 +126,7 @@ class _Tuner:
         return self._validate(start, np.nan)
 
     def advance(self, memory: TunerState) -> TunerState:
-        """Up to the next validation."""
+        """Runs the optimiser up to the next validation, validates, and selects restarts."""
         plan = self.plan
         vectors, state = jnp.asarray(memory.vectors), memory.optimiser
         end = min(memory.step + plan.validate_every, plan.steps)
@@ -141,7 +143,7 @@ class _Tuner:
         return self._select(memory) if memory.step < plan.steps else memory
 
     def _select(self, memory: TunerState) -> TunerState:
-        """The worse half goes on from the best of the better half, a little aside (Jaderberg and others, 2017)."""
+        """Replaces the worse half by the best of the better half plus noise (Jaderberg and others, 2017)."""
         plan = self.plan
         order = np.argsort(memory.scores, kind="stable")
         half = len(order) // 2
@@ -163,7 +165,7 @@ class _Tuner:
         )
 
     def finish(self, memory: TunerState, began: float) -> Tuning:
-        """Compares the best restarts on more starts and takes the best of them."""
+        """Compares the best restarts on more initial states and returns the best of them."""
         plan = self.plan
         semifinal, _, _ = self._score(memory.best, plan.final, _SEMIFINAL)
         chosen = np.argsort(semifinal, kind="stable")[: plan.finalists]
@@ -208,7 +210,7 @@ class _Tuner:
         )
 
     def _value_steps(self, starts: int, *, final: bool = False) -> int:
-        """RK4 steps of a score from so many starts."""
+        """Returns the RK4 steps of one controller's score from so many initial states."""
         plan = self.plan
         horizon, dt = (plan.final_horizon, plan.final_dt) if final else (plan.horizon, plan.horizon_dt)
         return starts * round(horizon / dt) + _watched(starts) * self.iterations
@@ -225,7 +227,7 @@ class _Tuner:
         return jax.tree.map(jnp.asarray, starts), plants
 
     def _gradient(self, vector: Vector, starts: State, plants: CartPole | None, width: jax.Array) -> Any:
-        """Loss and gradient of one restart, with no start's sensitivity drowning the others'."""
+        """Returns loss and gradient (d,) of one restart; each state's gradient is norm-clipped before averaging."""
         plan = self.plan
 
         def objective(vector: Vector, start: State, plant: CartPole | None) -> jax.Array:
@@ -242,22 +244,22 @@ class _Tuner:
         values = jnp.where(sound, values, worst)
         loss, shares = jax.value_and_grad(plan.aggregated)(values)
         slope = jnp.sum((shares * clip_factors)[:, None] * slopes, axis=0) + jax.grad(self._fast_pole_penalty)(vector)
-        return loss, jnp.where(jnp.isfinite(slope), slope, 0.0)  # Adam would remember a NaN for ever
+        return loss, jnp.where(jnp.isfinite(slope), slope, 0.0)  # a NaN would stay in Adam's moments
 
     def _fast_pole_penalty(self, vector: Vector) -> jax.Array:
-        """Grows once the fastest closed-loop pole is near its limit."""
+        """Returns a penalty on closed-loop poles faster than 90 % of `pole_limit`."""
         excess = jnp.log(fastest_pole_bound(self._closed_loop(vector)) / (0.9 * self.plan.pole_limit))
         return 10.0 * jnp.maximum(excess, 0.0) ** 2
 
     def _closed_loop(self, vector: Vector) -> jax.Array:
-        """A - B K (4, 4) of the law's own model."""
+        """Returns A - B K (4, 4) of the model used by the law."""
         A, B = linearize(self.free.model)
         regulator = self.free.build(vector).regulator
         assert isinstance(regulator, StateFeedback)
         return A - B @ jnp.asarray(regulator.K)
 
     def _score(self, vectors: Numbers, count: int, purpose: int) -> tuple[Numbers, Numbers, Numbers]:
-        """Score, success rate and mean settling time of each vector (n,), from `count` starts."""
+        """Returns score, success rate and mean settling time (n,) of vectors (n, d), from `count` initial states."""
         plan, goal = self.plan, self.plan.goal
         starts, plants = self._draw(count, purpose)
         final = purpose == _FINAL
@@ -266,7 +268,7 @@ class _Tuner:
         controllers, poles = descent.in_blocks(self.controllers, min(block, _CONTROLLERS), jnp.asarray(vectors))
 
         def over(run: Any, starts_each: int) -> Any:
-            """Of every controller from the first `starts_each` starts: arrays (n, starts_each)."""
+            """Returns `run` of every controller from the first `starts_each` states: arrays (n, starts_each)."""
             which, start = np.divmod(np.arange(len(vectors) * starts_each), starts_each)
             chosen = jax.tree.map(lambda column: column[which], controllers)
             drawn = jax.tree.map(lambda column: column[start], (starts, plants))
@@ -279,7 +281,7 @@ class _Tuner:
         cost = cost + goal.effort * runs.effort + goal.jerkiness * runs.voltage_variation
         score = np.mean(cost, axis=1)
         if watched := _watched(count):
-            # What has more crossings than can be located slides along its gate's boundary, and chatters on a real rig.
+            # More crossings than can be located: the run slides along the gate's boundary, and would chatter on a rig.
             sliding = (over(self.located_runs, watched).flag & Flag.OVERFLOW) != 0
             sliding = sliding & runs.success[:, :watched]  # the others have failed already
             score = score + failure * np.mean(sliding, axis=1)
@@ -290,7 +292,7 @@ class _Tuner:
         return score, successes / count, settled
 
     def _controller(self, vector: Vector) -> tuple[Hybrid, jax.Array]:
-        """The controller, and the magnitude of its fastest closed-loop pole [1/s]."""
+        """Returns the controller, and the magnitude of its fastest closed-loop pole [1/s]."""
         poles = jnp.linalg.eigvals(self._closed_loop(vector))
         return self.free.build(vector), jnp.max(jnp.abs(poles))
 
@@ -301,15 +303,15 @@ class _Tuner:
 
 
 def _watched(count: int) -> int:
-    """Of so many starts, how many are run with located switching too: an eighth, as each costs far more."""
+    """Returns how many of so many initial states also run with located switching: an eighth, as each costs far more."""
     return count // 8
 
 
 def fastest_pole_bound(A: jax.Array) -> jax.Array:
-    """A bound on the largest eigenvalue's magnitude of A (4, 4): |A^64|^(1/64) in the Frobenius norm (Gelfand, 1941).
+    """Returns a bound on the spectral radius of A (4, 4): |A^64|^(1/64) in the Frobenius norm (Gelfand, 1941).
 
-    Unlike the eigenvalues it has a derivative where some of them meet. It exceeds them by the 64th root of the
-    condition of A's eigenvectors, a tenth or so.
+    Unlike the eigenvalues it is differentiable where some of them coincide. It exceeds the spectral radius by the 64th
+    root of the condition number of A's eigenvectors, by about a tenth.
     """
     tiny = float(np.finfo(A.dtype).tiny)
     logarithm = jnp.zeros((), A.dtype)

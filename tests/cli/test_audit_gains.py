@@ -223,7 +223,7 @@ def regulator(**given):
     return np.asarray(build_controller(given, PLANT).regulator.K)
 
 
-def test_weights_give_the_lqr_of_the_plant_with_the_papers_weights_for_what_is_not_given():
+def test_weights_not_given_are_the_papers():
     Q, R = [20.0, 1.0, 50.0, 2.5], 0.01
     for given, expected in (
         ({"Q": Q, "R": R}, lqr(*MODEL, np.diag(Q), [[R]]).K),

@@ -642,7 +642,7 @@ def test_a_reproduction_prints_one_line_for_each_row_and_its_progress_in_order(r
     assert f"wrote {reproduced.folder / 'reproduction.json'}" in reproduced.out
 
 
-def test_an_interrupted_reproduction_goes_on_where_it_stopped_and_ends_with_identical_rows(
+def test_an_interrupted_reproduction_resumes_and_ends_with_identical_rows(
     command, tmp_path, no_pictures, monkeypatch, reproduced
 ):
     calls = []

@@ -176,7 +176,7 @@ def test_only_the_command_lines_own_process_is_prepared(monkeypatch, name, whole
     assert at_start.is_command() is expected
 
 
-def test_a_prepared_process_hides_xlas_alarm_unless_somebody_wants_it_and_gives_interrupts_back(monkeypatch):
+def test_a_prepared_process_hides_xlas_alarm_unless_asked_and_restores_interrupts(monkeypatch):
     before = signal.getsignal(signal.SIGINT)
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)

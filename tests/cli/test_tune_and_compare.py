@@ -89,7 +89,7 @@ def test_a_file_to_start_from_has_its_design_and_gate_already(option, value, tmp
     ("arguments", "words"),
     [
         (("--steps", "-1"), "steps = -1"),
-        (("--start-from", "nowhere"), "beginning = 'nowhere'"),
+        (("--start-from", "nowhere"), "start_from = 'nowhere'"),
         (("--frozen", "nonsense"), "frozen = 'nonsense'"),
         (("--track", "1"), "track"),
     ],

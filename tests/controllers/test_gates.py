@@ -77,7 +77,7 @@ def hybrid(gate):
     return cpjax.Hybrid(cpjax.EnergySwingUp(model, energy_gain=1.0), cpjax.StateFeedback([1.0, 2.0, 3.0, 4.0]), gate)
 
 
-def test_a_start_inside_the_hysteresis_band_starts_in_the_swing_up_law_and_stays_there_until_the_way_in():
+def test_inside_the_hysteresis_band_a_run_starts_in_the_swing_up_law():
     controller = hybrid(AngleGate(half_angle=0.4, hysteresis=0.25))
     mode = controller.start_mode(at(0.45))
     assert int(mode) == SWING_UP

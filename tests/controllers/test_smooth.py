@@ -57,7 +57,7 @@ def test_the_regulators_share_is_a_half_on_the_boundary_and_whole_far_inside():
 
 
 @pytest.mark.slow
-def test_a_smooth_loops_derivatives_agree_with_differences_and_it_goes_where_the_hard_one_goes_as_it_cools():
+def test_a_smooth_loop_has_right_derivatives_and_converges_to_the_hard_one():
     start = State(0.03, 0.0, math.pi - 0.25, 0.2)
 
     def end(x):

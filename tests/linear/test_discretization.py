@@ -284,7 +284,7 @@ def test_lists_and_whole_numbers_are_taken():
     assert model.A.dtype == jnp.float64
 
 
-def test_a_vector_is_taken_as_the_input_matrix_and_a_number_as_the_weight_of_one_input():
+def test_a_vector_is_taken_as_input_matrix_and_a_number_as_weight_of_one_input():
     A, B = UPRIGHT
     plain, right = discretize(A, B[:, 0], 0.1), discretize(A, B, 0.1)
     cost, right_cost = discretize_cost(A, B[:, 0], np.eye(4), 2, 0.1), discretize_cost(A, B, np.eye(4), [[2.0]], 0.1)

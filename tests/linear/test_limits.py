@@ -60,7 +60,7 @@ def used(half_angle, rate, angle, angle_rate):
 
 
 @rows("seed", range(5))
-def test_no_state_of_the_level_set_asks_for_more_than_the_voltage_limit_and_one_asks_for_all_of_it(seed):
+def test_the_level_set_demands_at_most_the_voltage_limit_and_reaches_it(seed):
     rng = np.random.default_rng(seed)
     P, gain, limit = random_form(rng), rng.normal(size=(1, 4)) * 30.0, rng.uniform(5.0, 30.0)
     level = float(level_within_voltage(P, gain, limit))
@@ -83,7 +83,7 @@ def test_no_state_of_the_level_set_leaves_the_angle_gate_and_one_stands_on_its_e
 
 @the_gates
 @rows("seed", range(3))
-def test_no_state_of_the_level_set_leaves_the_angle_and_rate_gate_and_one_stands_on_its_edge(half_angle, rate, seed):
+def test_the_level_set_lies_in_the_angle_rate_gate_and_touches_its_edge(half_angle, rate, seed):
     rng = np.random.default_rng(seed)
     P = random_form(rng)
     level = float(level_within_angle_and_rate(P, half_angle, rate))
@@ -115,7 +115,7 @@ def test_no_state_of_the_level_set_leaves_another_level_set_and_one_touches_it(s
     ],
     ids=["angle", "angle-rate", "lyapunov"],
 )
-def test_the_gates_themselves_are_open_all_over_the_level_set_and_shut_somewhere_just_outside(gate, level_of):
+def test_gates_are_open_all_over_the_level_set_and_shut_somewhere_outside(gate, level_of):
     rng = np.random.default_rng(4)
     P = random_form(rng)
     margin = jax.vmap(lambda s: gate.margin(State.from_vector(s), jnp.asarray(0)))
@@ -194,7 +194,7 @@ def test_only_the_symmetric_part_of_a_form_counts():
 # --- the paper --------------------------------------------------------------------------------------------------------
 
 
-def test_at_the_papers_switch_its_lqr_gain_asks_for_2500_volts_and_pole_placement_for_58():
+def test_at_the_papers_switch_lqr_asks_for_2500_volts_and_placement_for_58():
     for design, voltage, degrees in (("lqr", 2510.67, 0.14339), ("placement", 58.486, 6.1553)):
         gain = [paper.PRINTED_GAINS[design]]
         assert float(demanded_voltage(gain, paper.SWITCH_ANGLE)) == pytest.approx(voltage, rel=2e-5)
@@ -208,7 +208,7 @@ def test_at_the_papers_switch_its_lqr_gain_asks_for_2500_volts_and_pole_placemen
 
 
 @rows("design", ["placement", "lqr"])
-def test_the_lyapunov_function_is_scipys_and_falls_along_the_linear_closed_loop_by_what_was_asked(design):
+def test_the_lyapunov_function_is_scipys_and_falls_as_asked(design):
     gain = np.array([paper.PRINTED_GAINS[design]])
     Q = random_form(np.random.default_rng(6))
     P = np.asarray(lyapunov_function(A, B, gain, Q))
@@ -242,7 +242,7 @@ def metrics_from():
     return run
 
 
-def test_from_the_certified_boundary_of_pole_placement_the_plant_settles_without_ever_saturating(metrics_from):
+def test_from_placements_certified_boundary_the_plant_settles_unsaturated(metrics_from):
     P, level = certified(K, paper.SWITCH_ANGLE)
     points = boundary(P, 0.99 * level, 63, np.random.default_rng(7))
     extreme = np.linalg.solve(P, np.asarray(K)[0])
@@ -308,7 +308,7 @@ slopes = jax.jit(jax.grad(level_within_angle_and_rate, argnums=(0, 1, 2)))
 
 
 @pytest.mark.slow
-def test_second_derivatives_of_the_level_inside_angle_and_rate_are_those_of_the_first():
+def test_second_derivatives_of_the_level_inside_are_those_of_the_first():
     def gradient(limits):
         return jnp.stack(slopes(FORM, limits[0], limits[1])[1:])
 
@@ -320,12 +320,12 @@ def test_second_derivatives_of_the_level_inside_angle_and_rate_are_those_of_the_
 
 @rows("half_angle", [1e-6, 0.5, 3.1, math.pi])
 @rows("rate", [1e-6, 2.0, 1e4])
-def test_no_derivative_of_the_level_inside_angle_and_rate_is_nan_however_extreme_the_gate(half_angle, rate):
+def test_no_derivative_of_the_level_inside_angle_and_rate_is_nan(half_angle, rate):
     for P in (np.eye(4), FORM):
         assert all(np.all(np.isfinite(slope)) for slope in slopes(jnp.asarray(P), half_angle, rate))
 
 
-def test_the_level_inside_a_multiple_of_the_same_form_has_the_derivative_of_that_multiple():
+def test_the_level_inside_a_multiple_of_the_same_form_has_that_derivative():
     P = jnp.asarray(FORM)
 
     def level(factor):
@@ -403,7 +403,7 @@ def test_what_makes_no_sense_is_refused_by_name(function, given, field, allowed)
         function(*given)
 
 
-def test_under_jit_a_form_that_is_not_positive_definite_and_a_loop_that_is_not_stable_give_nan():
+def test_under_jit_an_indefinite_form_and_an_unstable_loop_give_nan():
     @jax.jit
     def levels(P):
         return jnp.stack(

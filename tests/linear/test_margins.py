@@ -202,7 +202,7 @@ def test_these_loops_have_between_them_every_kind_of_gain_margin():
 
 
 @every_loop
-def test_the_loop_is_stable_for_every_factor_between_the_gain_margins_and_for_none_just_outside(loop):
+def test_the_loop_is_stable_between_the_gain_margins_and_not_just_outside(loop):
     found = margins(*loop)
     lower, upper = float(found.gain_lower), min(float(found.gain_upper), 1e3)
     inside = lower + (upper - lower) * np.linspace(1e-6, 1 - 1e-6, 500)
@@ -238,7 +238,7 @@ def test_the_loop_is_stable_for_every_delay_below_the_delay_margin_and_not_above
 
 
 @every_loop
-def test_the_loop_is_stable_for_every_factor_in_the_disk_and_for_one_on_its_rim_it_is_not(loop):
+def test_the_loop_is_stable_for_every_factor_in_the_disk_but_not_on_its_rim(loop):
     A, B, K = loop
     found = numbers(margins(*loop))
     rng = np.random.default_rng(0)
@@ -427,7 +427,7 @@ def richardson(function, h):
 
 
 @every_loop
-def test_every_finite_margins_derivative_agrees_forward_in_reverse_and_with_differences(loop):
+def test_every_finite_margins_derivative_agrees_with_differences(loop):
     loop = tuple(map(jnp.asarray, loop))
     jacobian, values = reverse(loop)
     finite = np.isfinite(values)
@@ -510,7 +510,7 @@ def test_the_closed_loop_poles_are_sorted_and_python_controls():
     )
 
 
-def test_the_derivative_of_simple_poles_agrees_forward_in_reverse_and_with_differences():
+def test_the_derivative_of_simple_poles_agrees_with_differences():
     A, B, K = map(jnp.asarray, papers_loop("appendix", "placement"))
 
     @jax.jit

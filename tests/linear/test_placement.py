@@ -289,7 +289,7 @@ def functions(gain):
     return jax.jit(jax.vmap(gain)), jacobians
 
 
-def test_the_derivatives_in_all_arguments_agree_forward_in_reverse_and_with_differences_also_at_multiple_poles():
+def test_all_derivatives_agree_with_differences_at_multiple_poles_too():
     n, x = 3, points(3)
     batched, jacobians = functions(lambda x: gain(x, 3))
     forward, reverse = jacobians(jnp.asarray(x))
@@ -315,7 +315,7 @@ def exact_gain(x, n):
 
 
 @rows("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5, 6))])
-def test_derivatives_are_right_to_eight_digits_where_the_closed_loops_condition_is_below_a_million(n):
+def test_derivatives_have_eight_digits_where_the_condition_is_below_a_million(n):
     rng = np.random.default_rng(n)
     x = np.stack([vector(rng.normal(size=(n, n)), rng.normal(size=(n, 1)), -np.arange(1.0, n + 1)) for _ in range(12)])
     masks = np.stack([np.repeat(mask, [n * n, n, n]) for mask in np.eye(3)])
@@ -341,7 +341,7 @@ def test_derivatives_are_right_to_eight_digits_where_the_closed_loops_condition_
 
 
 @pytest.mark.slow
-def test_the_papers_gain_has_the_derivatives_that_differences_have_and_vmap_changes_nothing():
+def test_the_papers_gain_has_the_derivatives_of_differences_under_vmap_too():
     sets = np.stack([POLES, np.full(4, -4.0), [-3.0, -3.0, -5.0, -5.0]])
     x = np.stack([vector(A, B, p) for p in sets])
     steps = np.concatenate([np.full(20, 2e-3), 1e-2 * np.poly(POLES)[1:]])
@@ -385,7 +385,7 @@ def through_factors(x):
 
 
 @pytest.mark.slow
-def test_through_quadratic_factors_the_gain_is_smooth_where_two_real_poles_become_a_complex_pair():
+def test_the_gain_is_smooth_where_two_real_poles_become_a_complex_pair():
     meeting = QuadraticFactors(*(jnp.asarray(v) for v in ([4.0, 7.0], [4.0, 12.0], np.zeros(0)))).unconstrained()
     np.testing.assert_allclose(QuadraticFactors.from_unconstrained(meeting).poles(), [-2, -3, -2, -4], atol=1e-7)
     x = np.asarray(meeting)

@@ -100,7 +100,7 @@ def test_a_stable_mode_that_no_input_moves_is_weighed_as_it_decays(time):
 
 
 @both
-def test_without_an_input_that_moves_anything_the_solution_is_that_of_lyapunovs_equation(time):
+def test_without_an_effective_input_the_solution_is_that_of_lyapunovs_equation(time):
     A = np.array([[-1.0, 3.0], [0.0, -2.0]]) * (1.0 if time == "continuous" else 0.3)
     P, K, found = SOLVERS[time](A, np.zeros((2, 1)), np.eye(2), ONE)
     left = lyapunov_operator(A, time) @ np.ravel(P) + np.eye(2).ravel()
@@ -175,7 +175,7 @@ def test_a_problem_without_a_solution_is_refused_with_the_reason(time, name):
 
 
 @both
-def test_inside_jit_a_problem_without_a_solution_is_nan_and_not_found_and_spoils_no_other_lane(time):
+def test_inside_jit_an_unsolvable_problem_is_nan_and_affects_no_other_element(time):
     good = (np.array([[0.0, 1.0], [1.3, -0.2]]), np.array([[0.0], [1.0]]), np.diag([1.0, 2.0]), 0.5 * ONE)
     bad = [problem for _, problem in unsolvable(time).values()]
     broken = [tuple(np.where(i == j, np.nan, matrix) for j, matrix in enumerate(good)) for i in range(4)]
@@ -257,7 +257,7 @@ def test_a_weak_actuator_that_is_cheap_is_as_good_as_a_strong_one(time):
 
 
 @continuous_discrete_slow
-def test_a_weight_that_is_semidefinite_but_for_the_rounding_of_its_printing_is_accepted_or_named(time):
+def test_a_weight_semidefinite_but_for_rounding_is_accepted_or_named(time):
     rng = np.random.default_rng(8)
     A, B, c = rng.normal(size=(3, 3)), rng.normal(size=(3, 1)), rng.normal(size=(3, 1))
     exact = SOLVERS[time](A, B, c @ c.T, ONE).K
@@ -271,7 +271,7 @@ def test_a_weight_that_is_semidefinite_but_for_the_rounding_of_its_printing_is_a
             assert relative_error(K, exact) <= 10.0 ** (4 - digits)
 
 
-def test_a_mode_of_the_plant_where_the_cayley_transform_has_its_pole_is_like_any_other():
+def test_a_plant_mode_at_the_cayley_transforms_pole_is_like_any_other():
     pole = -0.8284031576393032
     modes = [pole + offset for offset in (-1e-9, -1e-12, -1e-15, 0.0, 1e-15, 1e-12, 1e-9)]
     P, _, found = solved_in_batches("continuous", [(np.diag([1.0, mode]), UP, 1e-8 * np.eye(2), ONE) for mode in modes])
@@ -325,7 +325,7 @@ def test_arguments_that_do_not_fit_are_refused_by_name(time, name):
 
 
 @continuous_discrete_slow
-def test_lists_whole_numbers_and_mixed_precision_are_welcome_and_the_widest_dtype_is_kept(time):
+def test_lists_integers_and_mixed_precision_are_taken_in_the_widest_dtype(time):
     right = SOLVERS[time]([[0.0, 1.0], [2.0, -1.0]], [[0.0], [1.0]], np.eye(2), ONE)
     whole = ([[0, 1], [2, -1]], [[0], [1]], [[1, 0], [0, 1]], [[1]])
     for problem in (whole, [np.array(x) for x in whole], [np.array(x, np.float32) for x in whole[:3]] + [ONE]):
@@ -403,7 +403,7 @@ def steps(time, problem):
         pytest.param("discrete", 4, 1, marks=pytest.mark.slow),
     ],
 )
-def test_the_derivatives_in_all_arguments_agree_forward_in_reverse_and_with_differences(time, n, m):
+def test_derivatives_in_all_arguments_agree_with_differences(time, n, m):
     rng = np.random.default_rng(10 * n + m)
     problems = [random_problem(n, m, rng) for _ in range(3)] + ([paper_problem(time)] if (n, m) == (4, 1) else [])
     batched, jacobians = functions(time, n, m)
@@ -488,7 +488,7 @@ def check_ill_conditioned_derivatives(time):
 
 @pytest.mark.slow
 @both
-def test_second_derivatives_are_the_differences_of_the_first_and_no_lane_of_a_batch_of_gradients_spoils_another(time):
+def test_second_derivatives_are_differences_and_no_batch_element_affects_another(time):
     problem = random_problem(2, 1, np.random.default_rng(11))
     x = vector(problem)
 

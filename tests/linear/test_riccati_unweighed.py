@@ -92,13 +92,13 @@ def test_whole_numbers_in_lists_and_a_number_for_the_input_weight_give_the_same_
     np.testing.assert_allclose(K, [[19.62, 6.26418390534633]], rtol=1e-15)
 
 
-def test_a_discrete_pole_outside_the_circle_without_weight_goes_to_its_inverse_and_one_inside_stays():
+def test_an_unweighed_discrete_pole_goes_to_its_inverse_or_stays_if_it_is_stable():
     K, P = dlqr(np.diag([1.5, 0.5]), UP, NONE, ONE)
     np.testing.assert_allclose(P, [[1.25, 0.0], [0.0, 0.0]], rtol=1e-15, atol=1e-30)
     np.testing.assert_allclose(K, [[1.5 - 1.0 / 1.5, 0.0]], rtol=1e-15, atol=1e-30)
 
 
-def test_a_singular_plant_without_weights_in_discrete_time_has_its_unstable_pole_mirrored():
+def test_a_singular_unweighed_discrete_plant_has_its_unstable_pole_mirrored():
     K, P = dlqr([[0.0, 2.0], [0.0, 3.0]], UP, NONE, ONE)
     np.testing.assert_allclose(P, [[0.0, 0.0], [0.0, 8.0]], rtol=1e-15, atol=1e-30)
     np.testing.assert_allclose(K, [[0.0, 8.0 / 3.0]], rtol=1e-15, atol=1e-30)
@@ -118,7 +118,7 @@ def test_a_repeated_pole_without_weight_is_mirrored_as_often_as_it_is_there():
 
 @both
 @pytest.mark.parametrize(("n", "m"), [(4, 1), pytest.param(6, 2, marks=pytest.mark.slow)])
-def test_whatever_is_not_weighed_the_gain_is_scipys_and_the_solution_right_to_rounding(time, n, m, systems):
+def test_whatever_is_not_weighed_the_gain_is_scipys_to_rounding(time, n, m, systems):
     problems = [partly_weighed(time, n, m, seed) for seed in range(60)]
     P, K, found = (np.asarray(x) for x in BATCHED[time](*stacked(problems)))
     assert np.all(found)
@@ -166,7 +166,7 @@ def test_without_any_weight_the_closed_loop_has_the_mirrored_modes(time):
 
 
 @both
-def test_the_units_of_the_states_change_no_digit_where_an_unstable_mode_has_no_weight(time):
+def test_units_change_no_digit_where_an_unstable_mode_has_no_weight(time):
     A, B = np.array([[1.2, 0.3], [0.7, -0.4]]), UP
     plain = DESIGNS[time](A, B, NONE, ONE)
     for exponents in ([20, -20], [-20, 20], [100, 100]):
@@ -176,7 +176,7 @@ def test_the_units_of_the_states_change_no_digit_where_an_unstable_mode_has_no_w
         np.testing.assert_allclose(P * units * units[:, None], plain.P, rtol=1e-15)
 
 
-def test_the_cart_pole_with_its_position_alone_weighed_is_solved_and_with_its_angle_alone_names_the_mode_at_zero():
+def test_weighing_position_alone_is_solved_and_angle_alone_names_the_mode_at_zero():
     A, B = (np.asarray(matrix) for matrix in linearize(paper.appendix_plant()))
     K, P = lqr(A, B, np.diag([1.0, 0.0, 0.0, 0.0]), 1e-4)
     right = scipys("continuous", A, B, np.diag([1.0, 0.0, 0.0, 0.0]), 1e-4 * ONE)
@@ -211,14 +211,14 @@ ON_BOUNDARY = {
 
 
 @pytest.mark.parametrize("name", ON_BOUNDARY)
-def test_a_mode_on_the_boundary_of_stability_without_weight_is_refused_by_its_eigenvalue(name):
+def test_an_unweighed_mode_on_the_stability_boundary_is_refused_by_its_eigenvalue(name):
     time, A, B, mode = ON_BOUNDARY[name]
     with pytest.raises(InputError, match=f"^Q = .*: must be detectable .* with eigenvalue {mode}$"):
         DESIGNS[time](A, B, NONE, ONE)
 
 
 @both
-def test_inside_jit_a_mode_on_the_boundary_without_weight_is_nan_in_its_own_lanes_only(time):
+def test_inside_jit_an_unweighed_boundary_mode_is_nan_in_its_own_elements_only(time):
     bad = [(A, B, NONE, ONE) for kind, A, B, _ in ON_BOUNDARY.values() if kind == time]
     good = (np.array([[1.5, 0.2], [0.1, 0.4]]), UP, NONE, ONE)
     P, K, found = (np.asarray(x) for x in BATCHED[time](*stacked([good, *bad, good, good])))
@@ -238,7 +238,7 @@ def test_an_unstable_mode_that_no_input_moves_is_refused_without_weights_too():
             design(np.diag(modes), LAST, NONE, ONE)
 
 
-def test_in_discrete_time_an_input_without_weight_is_refused_although_it_moves_a_weighed_state():
+def test_in_discrete_time_an_input_without_weight_is_refused():
     with pytest.raises(
         InputError, match=r"^R = .* positive definite: every input must cost something; that R \+ B' P B"
     ):
@@ -277,7 +277,7 @@ def differences(function, x, step):
 
 
 @both
-def test_where_q_is_zero_the_derivatives_agree_forward_in_reverse_and_with_differences(time):
+def test_where_q_is_zero_the_derivatives_agree_with_differences(time):
     value, x = family(time)
     first = differences(jax.jit(jax.vmap(value)), x, 1e-3)
     forward, reverse = jax.jit(lambda x: (jax.jacfwd(value)(x), jax.grad(value)(x)))(jnp.asarray(x))

@@ -87,7 +87,7 @@ def test_the_two_encoders_see_position_and_angle():
     np.testing.assert_array_equal(np.array(POSITION_AND_ANGLE) @ state.vector(), [state.x, state.theta])
 
 
-def test_the_angle_alone_does_not_say_where_the_cart_is_and_the_position_alone_says_everything():
+def test_the_angle_alone_observes_no_cart_and_the_position_alone_everything():
     A, _ = papers_model()
     angle = observability(A, POSITION_AND_ANGLE[1])
     assert (int(angle.rank), bool(angle.full)) == (3, False)
@@ -116,7 +116,7 @@ def test_textbook_pairs_have_their_textbook_rank_and_so_have_their_duals(A, B, r
 
 
 @rows("shape", FEW_SHAPES)
-def test_the_gramians_of_a_stable_system_for_all_time_are_those_of_lyapunovs_equation(shape):
+def test_infinite_gramians_of_a_stable_system_are_those_of_lyapunovs_equation(shape):
     A, B, C = stable_system(*shape)
     expected = solve_continuous_lyapunov(A, -B @ B.T), solve_continuous_lyapunov(A.T, -C.T @ C)
     for horizon in (None, math.inf):

@@ -72,7 +72,7 @@ def test_a_product_of_two_floats_is_right_to_four_units_of_eps_squared(dtype, mo
 @DTYPES
 @EVERY_MODE
 @rows("name", EXACT)
-def test_the_error_of_an_operation_is_within_six_units_of_eps_squared_of_what_goes_into_it(dtype, mode, name):
+def test_the_error_of_an_operation_is_within_six_units_of_eps_squared(dtype, mode, name):
     x, y = double_words(dtype, 2), double_words(dtype, 3)
     opposite = DoubleWord(-np.nextafter(x.high, dtype(0)), x.low)  # a sum with y that cancels almost altogether
     for other in (y, opposite) if name == "add" else (y,):

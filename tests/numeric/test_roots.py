@@ -57,7 +57,7 @@ def test_the_located_fraction_has_no_derivative_and_none_that_is_nan():
         assert gradient == (0.0, 0.0, 0.0, 0.0)
 
 
-def test_one_newton_correction_carries_the_derivative_of_the_implicit_function_theorem():
+def test_one_newton_correction_has_the_derivative_of_the_implicit_function_theorem():
     def time(p):  # where p - t^2 is zero, from a time that is known and has no derivative
         known = jax.lax.stop_gradient(jnp.sqrt(p))
         return known + newton_correction(p - known * known, -2.0 * known, 1.0)

@@ -90,7 +90,7 @@ def test_the_derivatives_agree_forward_in_reverse_and_with_differences():
             assert relative_error(reverse[i], forward[i]) <= 1e-12
 
 
-def test_there_and_back_again_has_the_derivative_one_and_none_is_nan_where_the_matrix_is_singular():
+def test_a_transform_and_its_inverse_have_derivative_one_and_none_is_nan():
     x = np.array([1.0, 2.0, 3.0, 0.3, -0.4, 0.5])
     singular = np.stack([x * [1, 1, 1, 1, 1, 0], x * [1, 1, 0, 1, 0, 1], 0 * x])
     whole = jax.jit(jax.vmap(jax.jacfwd(lambda x: from_semidefinite(semidefinite(x)))))(jnp.asarray([x, *singular]))

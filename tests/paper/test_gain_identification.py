@@ -124,7 +124,7 @@ def test_a_design_that_makes_no_sense_is_refused_by_name(make, field, allowed):
         make()
 
 
-def test_the_papers_prints_are_its_gains_with_two_decimals_and_what_they_were_designed_for():
+def test_the_papers_printed_gains_have_two_decimals_and_their_designs():
     placement, lqr = printed_in_the_paper()
     assert (placement.design, placement.poles, placement.Q, placement.R) == ("placement", paper.POLES, None, None)
     assert (lqr.design, lqr.poles, lqr.Q, lqr.R) == ("lqr", None, paper.Q, paper.R)
@@ -167,7 +167,7 @@ def test_the_same_seed_gives_the_same_audit(papers):
     assert (again.unchanged, again.fits, again.directions) == (papers.unchanged, papers.fits, papers.directions)
 
 
-def test_the_residuals_are_scipys_gains_less_the_printed_ones_in_units_of_the_last_digit(papers):
+def test_residuals_are_scipys_gains_less_the_printed_in_units_of_the_last_digit(papers):
     design = paper.Q, paper.R, paper.POLES
     printed = np.concatenate([paper.PRINTED_GAINS["placement"], paper.PRINTED_GAINS["lqr"]])
     plants = [with_parameters(APPENDIX, dict(zip(f.parameters, f.values, strict=True))) for f in papers.fits]
@@ -205,7 +205,7 @@ def test_progress_counts_the_sets_up_to_their_number():
 
 
 @rows("names", [("pole_length", "cart_friction"), ("pivot_friction", "gear_ratio")])
-def test_the_wrong_parameters_of_a_rig_are_recovered_as_precisely_as_the_directions_promise(names):
+def test_wrong_parameters_of_a_rig_are_recovered_as_precisely_as_promised(names):
     rig = rough_plant()
     prints = prints_of(rig)
     audit = audit_gains(prints, off(rig, names), parameters=names, **SMALL)
@@ -241,7 +241,7 @@ def room(audit, name):
     return math.sqrt(8.0) * 0.5 / math.hypot(*(d.sensitivity * d.weights[name] for d in audit.directions))
 
 
-def test_of_two_parameters_that_act_as_a_ratio_the_ratio_is_recovered_and_neither_of_them():
+def test_of_two_parameters_that_act_as_a_ratio_only_the_ratio_is_recovered():
     rig, names = rough_plant(), ("torque_constant", "resistance")
     audit = audit_gains(prints_of(rig), off(rig, names, (1.3, 1.1)), parameters=names, **SMALL)
     assert [fit.parameters for fit in sorted(audit.simplest, key=lambda f: f.parameters)] == [names[1:], names[:1]]
@@ -371,7 +371,7 @@ def test_more_fits_than_run_side_by_side_are_those_of_one_go(monkeypatch):
     assert [len(fit.values) for fit in audit.fits] == [1, 1, 2]
 
 
-def test_the_least_squares_method_finds_the_end_of_rosenbrocks_valley_and_never_leaves_a_start_that_is_not_finite():
+def test_least_squares_finds_rosenbrocks_minimum_and_stays_at_a_start_not_finite():
     def residuals(x):
         r = jnp.stack([10.0 * (x[1] - x[0] ** 2), 1.0 - x[0]])
         return r, jnp.stack([jnp.stack([-20.0 * x[0], 10.0 * jnp.ones_like(x[0])]), jnp.asarray([-1.0, 0.0])])

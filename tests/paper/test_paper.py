@@ -107,7 +107,7 @@ def test_the_printed_gravity_vector_has_a_row_more_than_there_are_coordinates():
         np.testing.assert_allclose(gravity, height, rtol=1e-12)
 
 
-def test_what_the_solved_equation_yields_are_accelerations_and_not_the_printed_velocities():
+def test_the_solved_equation_yields_accelerations_and_not_the_printed_velocities():
     for q, v, (voltage, _) in POINTS:
         inertia, coriolis, gravity = matrix_form(q, v)
         pull = np.array([APPENDIX.motor.force_per_voltage * voltage - APPENDIX.motor.damping * v[0], 0.0])
@@ -192,7 +192,7 @@ def test_the_printed_energy_rate_has_the_wrong_sign_for_this_theta():
         assert rate_under_acceleration(energy, s, x_ddot) != pytest.approx(-holds, rel=0.1)  # as printed
 
 
-def test_the_printed_law_drives_the_energy_away_from_zero_and_the_opposite_sign_drives_it_there():
+def test_the_printed_law_drives_the_energy_away_and_the_opposite_sign_drives_it_back():
     for q, v, _ in POINTS:
         s = state(q, v)
         command = paper.ENERGY_GAIN * energy(s) * s.theta_dot * jnp.cos(s.theta)
@@ -213,7 +213,7 @@ def test_the_printed_energy_error_is_no_energy_and_never_negative():
     assert float(printed_energy_error(upright)) == float(energy(upright)) == 0.0
 
 
-def test_two_thirds_belongs_to_a_uniform_rod_of_half_length_l_and_one_half_to_the_massless_pole():
+def test_two_thirds_belongs_to_a_uniform_rod_and_one_half_to_a_point_bob():
     turning = cpjax.State(0.0, 0.0, 0.0, 1.0)  # upright: no potential energy
     rod = cpjax.CartPole.rod(mass=m, length=2 * l)
     assert float(rod.pendulum_energy(turning)) == pytest.approx(2.0 / 3.0 * m * l * l, rel=1e-12)
@@ -221,7 +221,7 @@ def test_two_thirds_belongs_to_a_uniform_rod_of_half_length_l_and_one_half_to_th
 
 
 @pytest.mark.parametrize("plant", [APPENDIX, IDENTIFIED], ids=["appendix", "identified"])
-def test_the_laws_output_is_an_acceleration_and_takes_an_inversion_to_become_a_voltage(plant):
+def test_the_laws_output_is_an_acceleration_and_needs_inversion_to_a_voltage(plant):
     law = paper.LAWS["corrected"](plant)
     for q, v, _ in POINTS:
         s = state(q, v)

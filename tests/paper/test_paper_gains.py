@@ -16,7 +16,7 @@ M, m, l, g = APPENDIX.moving_mass, APPENDIX.pole_mass, APPENDIX.pole_length, APP
 HALF_DIGIT = 0.005  # the gains are printed with two decimals
 
 
-def test_the_appendix_is_as_printed_and_the_identified_plant_differs_in_two_numbers_of_its_linear_model():
+def test_the_identified_plant_differs_from_the_appendix_in_two_numbers():
     motor = APPENDIX.motor
     assert (APPENDIX.cart_mass, APPENDIX.pole_mass, APPENDIX.pole_length, APPENDIX.gravity) == (1.0, 0.5, 0.7, 9.81)
     assert (APPENDIX.pole_inertia, APPENDIX.cart_friction, APPENDIX.pivot_friction) == (0.0, 0.0, 0.0)
@@ -61,7 +61,7 @@ def test_every_printed_gain_follows_from_the_identified_plant_to_its_last_digit(
     np.testing.assert_allclose(in_half_digits, expected, rtol=0, atol=0.006)
 
 
-def test_the_printed_gains_fix_the_force_per_volt_to_four_decimals_and_the_damping_to_two():
+def test_the_printed_gains_fix_force_per_volt_to_four_decimals_and_damping_to_two():
     def misfit(force_per_voltage, damping):
         """Largest residual of the eight gains, in half digits."""
         drag, push = -damping / M, force_per_voltage / M
@@ -99,7 +99,7 @@ def test_the_printed_gains_leave_resistance_and_the_split_of_the_constants_open(
         np.testing.assert_allclose(matrix, same, rtol=1e-12)
 
 
-def test_the_printed_placement_gain_puts_other_poles_than_the_ones_it_was_designed_for():
+def test_the_printed_placement_gain_places_other_poles_than_its_design():
     expected = {
         "appendix": (APPENDIX, [-5.262 - 3.942j, -5.262 + 3.942j, -3.875, -2.070]),
         "identified": (IDENTIFIED, [-5.693, -5.408, -3.872, -3.020]),  # rounding of the printed gain alone

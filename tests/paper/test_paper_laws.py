@@ -118,7 +118,7 @@ def test_the_corrected_law_read_as_a_voltage_never_gets_there(plant, clock):
 
 
 @both_plants
-def test_with_both_signs_corrected_but_two_thirds_kept_the_voltage_law_swings_lower_still(plant):
+def test_with_both_signs_corrected_but_two_thirds_kept_the_law_swings_lower_still(plant):
     law = SignedSwingUp(plant, outer_sign=-1.0, potential_sign=1.0)
     closest, _, _, _ = cpjax.sweep(plant, law, hanging_starts(), metrics=Reach(plant), **SAMPLED)
     assert np.all(np.round(closest) == (93 if plant is APPENDIX else 102))
@@ -131,7 +131,7 @@ def test_the_corrected_law_inverted_to_a_voltage_gets_to_the_switch_from_every_s
     assert np.max(closest) < 24.0
 
 
-def test_the_corrected_law_reaches_the_energy_of_upright_only_where_the_voltage_has_no_limit():
+def test_the_corrected_law_reaches_the_upright_energy_only_without_a_voltage_limit():
     def late_energy(limit):
         plant = dataclasses.replace(APPENDIX, motor=dataclasses.replace(APPENDIX.motor, voltage_limit=limit))
         fold = Reach(plant, 50.0)
@@ -146,7 +146,7 @@ def test_the_corrected_law_reaches_the_energy_of_upright_only_where_the_voltage_
 
 
 @pytest.mark.parametrize(("plant", "volts"), [(APPENDIX, 14.95), (IDENTIFIED, 14.40)], ids=PLANTS)
-def test_holding_the_pivot_still_against_a_bob_that_swings_through_upright_takes_more_than_12_volts(plant, volts):
+def test_holding_the_pivot_still_at_upright_takes_more_than_12_volts(plant, volts):
     theta = jnp.linspace(0.0, math.pi, 20001)
     swing = at(theta, jnp.sqrt(2 * plant.gravity / plant.pole_length * (1.0 - jnp.cos(theta))))
     np.testing.assert_allclose(plant.pendulum_energy(swing), 0.0, atol=1e-12)

@@ -113,7 +113,7 @@ def test_the_kick_starts_every_gain_within_four_seconds(plant, numbers, seconds)
 
 @pytest.mark.slow
 @both_plants
-def test_from_rest_the_kicked_law_settles_at_the_same_time_in_either_precision_on_either_clock(plant):
+def test_from_rest_the_kicked_law_settles_alike_in_either_precision_and_clock(plant):
     controller = paper.controller("corrected-centred", "placement", plant)
     times = [
         float(

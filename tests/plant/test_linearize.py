@@ -10,7 +10,7 @@ from cpjax.pytree import cast
 
 
 def corrected_appendix(plant):
-    """A_lin and B_lin of the paper's appendix with its sign errors corrected: point bob, r = 1 m, n = 1, no friction."""
+    """A_lin and B_lin of the paper's appendix with its sign errors corrected: point bob, r = n = 1, no friction."""
     k_t, k_v, b_m = plant.motor.torque_constant, plant.motor.back_emf_constant, plant.motor.viscous_friction
     r, l, g, m = plant.motor.resistance, plant.pole_length, plant.gravity, plant.pole_mass
     m_c = plant.motor.rotor_inertia + plant.cart_mass

@@ -102,7 +102,7 @@ def test_the_pendulum_energy_is_zero_upright_and_minus_two_weights_hanging():
     np.testing.assert_allclose(pendulum(plants, HANGING), -2.0 * weight, rtol=1e-15)
 
 
-def test_the_pendulum_energy_is_the_total_energy_above_upright_of_a_pole_whose_cart_is_at_rest():
+def test_the_pendulum_energy_is_the_total_energy_above_upright_of_a_cart_at_rest():
     plants, states, _ = random_problem(11)
     states = replace(states, x_dot=jnp.zeros(1000))
     weight = plants.pole_mass * plants.gravity * plants.pole_length

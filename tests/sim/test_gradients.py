@@ -58,7 +58,7 @@ def test_arguments_that_mean_nothing_are_refused_by_name(arguments, field):
 
 
 @pytest.mark.parametrize("direction", ["forward", "reverse"])
-def test_an_objective_that_is_no_number_and_parameters_that_are_no_floats_are_refused(direction):
+def test_an_objective_that_is_no_number_and_parameters_not_floats_are_refused(direction):
     with pytest.raises(InputError) as caught:
         gradients(lambda p, start: p["cart"], parameters(), STARTS, direction=direction)
     assert caught.value.field == "objective"

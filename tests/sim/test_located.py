@@ -78,7 +78,7 @@ def test_without_clip_and_crossing_it_is_the_rollout_that_reads_its_mode_per_ste
         *(pytest.param(g, marks=pytest.mark.slow) for g in ("level set", "angle", "angle and rate")),
     ],
 )
-def test_samples_are_on_the_grid_inside_the_supply_and_in_the_mode_that_the_gate_gives(gate):
+def test_samples_are_on_the_grid_inside_the_supply_and_in_the_gates_mode(gate):
     controller = loop(gate)
     run = located(PLANT, controller, NEAR)
     np.testing.assert_allclose(run.time, 2e-3 * np.arange(1201), rtol=1e-12)
@@ -203,7 +203,7 @@ class Elapsed:
 
 
 @pytest.mark.slow
-def test_with_coarse_steps_time_never_runs_backwards_and_the_supply_is_never_exceeded():
+def test_with_coarse_steps_time_only_grows_and_the_supply_is_never_exceeded():
     draws = random_draws(1500, 3, jnp.float64)
 
     def seen(x):

@@ -126,7 +126,7 @@ def test_it_is_that_of_differences_of_the_mean_within_three_standard_errors(dela
     assert abs(plain[:, 2].mean() - expected) > 5.0 * error  # the gate angle
 
 
-def test_with_an_observer_in_the_loop_it_differs_from_the_pathwise_one_and_forward_is_reverse():
+def test_with_an_observer_it_differs_from_the_pathwise_one_and_forward_is_reverse():
     made, _ = observer.example()
 
     def outside(p, derivative):
@@ -176,7 +176,7 @@ def test_a_quantiser_has_the_derivative_that_its_name_says():
         cpjax.quantize(0.1, 0.1, derivative="one")
 
 
-def test_the_gradient_of_a_mean_is_the_mean_of_the_gradients_under_vmap_and_in_a_sweep():
+def test_the_gradient_of_a_mean_is_the_mean_of_gradients_under_vmap_and_in_sweeps():
     starts = catching(6, 6)
     settings = {"duration": 0.8, "dt": 0.002, "derivative": "mean", "metrics": cpjax.TimeOutside()}
     each = derivatives(starts, duration=0.8, dt=0.002, derivative="mean")

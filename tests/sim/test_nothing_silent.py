@@ -85,7 +85,7 @@ class RandomMemory:
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.filterwarnings("ignore::cpjax.PerformanceWarning")  # it has matrix products
-def test_a_random_controller_with_memory_does_the_same_in_rollout_measure_and_sweep_traced_or_not(seed):
+def test_a_random_controller_is_the_same_in_rollout_measure_and_sweep_traced_or_not(seed):
     rng = np.random.default_rng(seed)
     gate = cpjax.AngleGate(rng.uniform(0.2, 2.0), hysteresis=rng.uniform(0.0, 0.3))
     law = cpjax.EnergySwingUp(PLANT, energy_gain=rng.uniform(1.0, 20.0), cart_stiffness=2.0)

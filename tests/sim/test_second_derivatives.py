@@ -30,7 +30,7 @@ STARTS = {
 
 @pytest.mark.slow  # a minute of compiling each
 @pytest.mark.parametrize("changes", STARTS)
-def test_hessian_vector_products_through_located_switches_are_differences_of_the_gradient(changes):
+def test_hessian_products_through_located_switches_are_differences_of_gradients(changes):
     start, duration = STARTS[changes]
     run = {"duration": duration, "dt": 0.005, "switching": "located"}
 

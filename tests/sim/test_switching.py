@@ -209,7 +209,7 @@ class Sharp(NamedTuple):
         return q, 0.5 * v, mode + 1
 
 
-def test_a_guard_unlike_a_cubic_is_located_all_the_same_and_time_never_runs_backwards():
+def test_a_guard_unlike_a_cubic_is_located_and_time_never_runs_backwards():
     at = jnp.linspace(0.21, 0.39, 37)
 
     def end(at):

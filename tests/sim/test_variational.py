@@ -72,12 +72,12 @@ def check(group, count, seed, at_least):
 
 
 @pytest.mark.slow
-def test_through_a_catch_with_clip_the_derivatives_are_those_of_the_variational_equation():
+def test_through_catch_and_clip_derivatives_are_those_of_the_variational_equation():
     check(GROUPS[3], 2, seed=11, at_least=2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.name)
-def test_of_thirty_random_loops_the_derivatives_are_those_of_the_variational_equation(group):
+def test_derivatives_of_thirty_random_loops_are_those_of_the_variational_equation(group):
     numbers = check(group, 8, seed=12, at_least=8)
     assert len(numbers) >= (1 if "level" in group.name else 2)  # of crossings of the gate

@@ -29,7 +29,7 @@ def test_every_cell_has_one_start_somewhere_inside_it():
 
 
 @rows("cells", [20, 60])
-def test_the_area_of_a_disc_lies_in_its_interval_and_the_interval_shrinks_with_the_cells(cells):
+def test_the_area_of_a_disc_lies_in_its_interval_which_shrinks_with_the_cells(cells):
     """A disc of radius 1; its boundary passes through about 4 cells per cell of its diameter."""
     inside, widths = [], []
     for seed in range(100):
@@ -76,11 +76,11 @@ def test_a_cells_outcome_is_that_of_a_rollout_from_its_start():
         (lambda: Axis("x", None, 1.0), "Axis.low"),
         (lambda: Axis("x", np.array([0.0, 0.5]), 1.0), "Axis.low"),
         (lambda: Axis("x", 0.0, 1.0, 1), "Axis.cells"),
-        (lambda: StartGrid(ANGLE, RATE, {"x": 0.0}), r"Map.others\[x\]"),
-        (lambda: StartGrid(ANGLE, RATE, {"x": (0.0, "1")}), r"Map.others\[x\]"),
-        (lambda: StartGrid(ANGLE, ANGLE), "Map.up"),
-        (lambda: StartGrid(ANGLE, RATE, {"theta": (0.0, 0.0)}), "Map.others"),
-        (lambda: StartGrid(ANGLE, RATE, {"x": (1.0, 0.0)}), r"Map.others\[x\]"),
+        (lambda: StartGrid(ANGLE, RATE, {"x": 0.0}), r"StartGrid.others\[x\]"),
+        (lambda: StartGrid(ANGLE, RATE, {"x": (0.0, "1")}), r"StartGrid.others\[x\]"),
+        (lambda: StartGrid(ANGLE, ANGLE), "StartGrid.up"),
+        (lambda: StartGrid(ANGLE, RATE, {"theta": (0.0, 0.0)}), "StartGrid.others"),
+        (lambda: StartGrid(ANGLE, RATE, {"x": (1.0, 0.0)}), r"StartGrid.others\[x\]"),
         (lambda: StartGrid(ANGLE, RATE, seed=-1), "Map.seed"),
     ],
 )

@@ -53,17 +53,17 @@ def test_the_fastest_within_a_bound_never_fails_if_any_does_not():
     assert (vector, time) == (3.0, math.inf)  # none keeps to it: the cheapest of those that never fail
 
 
-def test_where_none_settles_from_enough_starts_those_count_that_nearly_match_the_best():
+def test_where_none_settles_enough_those_count_that_nearly_match_the_best():
     met = judged([(0.6, 3.0, 10.0), (0.59, 2.0, 20.0), (0.3, 1.0, 5.0)])
     assert met.fastest("effort", 100.0, 0.99) == (1.0, 2.0)
     assert met.epsilon_grid("effort", FrontConfig(bounds=2)).tolist() == pytest.approx([8.5, 20.0, math.inf])
 
 
 @pytest.mark.slow
-def test_the_reference_is_the_same_for_both_designs_and_beyond_their_bland_starts():
+def test_the_reference_is_the_same_for_both_designs_and_beyond_their_baselines():
     found = reference_points(PLANT, FrontConfig(final=64))
     for lane in lanes(PLANT):
-        points = np.array([found.bland[design][lane] for design in ("lqr", "placement")])
+        points = np.array([found.baseline[design][lane] for design in ("lqr", "placement")])
         np.testing.assert_allclose(found.reference[lane], 1.1 * points.max(axis=0))
 
 
@@ -149,7 +149,7 @@ def test_a_small_front_is_made_of_controllers_that_do_what_its_points_say():
         assert len(front.points) >= 2
         assert len(nondominated(front.points)) == len(front.points)
         assert np.all(front.success >= plan.success)
-        assert np.all(front.points[0, 0] < measure.bland["placement"][12.0, cost][0])
+        assert np.all(front.points[0, 0] < measure.baseline["placement"][12.0, cost][0])
         assert front.volume > 0.0
         free = free_parameters(baseline("placement", PLANT))
         for point, vector in zip(front.points, front.vectors, strict=True):

@@ -167,9 +167,9 @@ def test_a_short_track_is_tried_with_gentler_pumping_too():
     assert least[True] - least[False] == pytest.approx(math.log(0.2), abs=0.05)
 
 
-@pytest.mark.parametrize("name", ["bland", "paper"])
+@pytest.mark.parametrize("name", ["baseline", "bland", "paper"])
 @pytest.mark.parametrize("design", ["lqr", "placement"])
-def test_a_beginning_may_have_the_level_set_of_its_own_design(name, design):
+def test_an_initial_controller_may_have_the_level_set_of_its_own_design(name, design):
     made = initial_controller(name, design, PLANT, "lyapunov")
     assert free_parameters(made).labels[-1] == "level"
     found = made.regulator.design.solve(*linearize(PLANT))

@@ -56,7 +56,7 @@ def test_a_checkpoint_of_another_tuning_is_refused(tuner, tmp_path):
         tune(PLANT, tuner.free, SMALL, checkpoint=path)
 
 
-def test_candidates_are_compared_on_more_and_more_starts_and_the_given_controller_stays(monkeypatch):
+def test_candidates_are_compared_on_more_starts_and_the_given_controller_stays(monkeypatch):
     free = free_parameters(baseline("placement", PLANT))
     asked, seen = [], []
 

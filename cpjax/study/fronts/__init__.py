@@ -1,1 +1,1 @@
-"""Trade-offs between settling time and what it costs: fronts of controllers."""
+"""Fronts of controllers that trade settling time against effort, cart travel or voltage variation."""

@@ -1,4 +1,4 @@
-"""What a search for trade-off fronts met and what it took, and its file: a search that is done is not done again."""
+"""Result of a search for trade-off fronts and its file, so that a finished search is not repeated."""
 
 import io as buffers
 from collections.abc import Callable, Mapping
@@ -14,22 +14,27 @@ _COUNTS = ("begun", "values", "gradients")
 
 
 class Search(NamedTuple):
-    """All by supply [V]."""
+    """Result of a search, by supply [V]."""
 
     met: Mapping[float, Evaluated]
-    """Every controller that was judged by more than the screening."""
+    """Archive of every controller that was evaluated by more than the screening."""
     begun: Mapping[float, int]
-    """How many of them the candidates gave."""
+    """Number of those that came from the candidates."""
     values: Mapping[float, int]
     """Runge-Kutta steps of values."""
     gradients: Mapping[float, int]
-    """And of gradients."""
+    """Runge-Kutta steps of gradients."""
     seconds: float
-    """Not by supply: what the search took."""
+    """Wall time of the whole search, not by supply [s]."""
 
 
 def load_or_run(path: Path | None, search: Callable[[], Search]) -> Search:
-    """What the file holds, or else what `search` finds, then written there; no `path`, no file."""
+    """Loads the cached result, or runs `search` and caches it.
+
+    Args:
+      path: the NPZ file, or None to run `search` without a file.
+      search: runs the search.
+    """
     if path is not None and path.exists():
         with np.load(path) as archive:
             columns = dict(archive)

@@ -1,4 +1,4 @@
-"""How trade-off fronts are traced: what is traded, and how much work goes into it."""
+"""Configuration of the search for trade-off fronts: the costs, and how much work is done."""
 
 import dataclasses
 from typing import TypeAlias
@@ -7,7 +7,7 @@ from cpjax.pytree import Number
 from cpjax.tune.config import check_plan
 
 COSTS = ("effort", "cart_travel", "voltage_variation")
-"""Of `Metrics`, against the settling time."""
+"""Fields of `Metrics` that are traded against the settling time."""
 
 Lane: TypeAlias = tuple[float, str]
 """A supply [V] and a cost."""
@@ -15,38 +15,39 @@ Lane: TypeAlias = tuple[float, str]
 
 @dataclasses.dataclass(frozen=True)
 class FrontConfig:
-    """How fronts are traced.
+    """Configuration of the search for trade-off fronts.
 
     Attributes:
-      seed: of everything random. Starts are never those that a seed names for `cpjax.sample_starts`.
-      bounds: tunings for each cost and supply, each with a bound on the cost, from `lowest` times the least cost among
-        the candidates geometrically to the cost of the fastest; and one more without a bound.
-      lowest: see there.
-      fine: what a second costs that a stopped run leaves undone, beyond itself [1].
-      price: of a bound's worth of a cost, at first [s].
-      price_rate: the price grows by exp(price_rate (cost / bound - 1)) in each step.
-      dearest: it stays between `price` / `dearest` and `price` times `dearest`.
-      candidates: random controllers to begin with.
-      screening: starts by which they are judged.
+      seed: of all random numbers. No seed below 2**32 draws the same initial states by `cpjax.sample_starts`.
+      bounds: number of tunings for each cost and supply that have a bound on the cost, geometrically from `lowest`
+        times the least cost among the candidates to the cost of the fastest; one more has no bound.
+      lowest: factor of the lowest bound [1].
+      fine: extra weight of each second lost when a run stops early [1].
+      price: initial multiplier, of a cost in units of its bound [s].
+      price_rate: in each step the multiplier grows by a factor exp(price_rate (cost / bound - 1)) [1].
+      dearest: the multiplier is clipped to [price / dearest, price * dearest] [1].
+      candidates: random controllers with which the search begins.
+      screening: initial states on which candidates are screened.
       steps: of the optimiser.
-      batch: starts of a step.
-      explore: noise on the unconstrained parameters of a tuning that goes on from another's, less and less to the end.
-      learning_rate: Adam's.
-      clip: a start's gradient is shortened to this many times the batch's median norm.
+      batch: initial states of a step.
+      explore: standard deviation of the noise on the unconstrained parameters of a tuning that continues from another
+        controller; falls linearly to zero.
+      learning_rate: initial learning rate of Adam; it falls to a tenth along a cosine.
+      clip: each initial state's gradient is norm-clipped to this many times the batch's median norm.
       duration: of the tunings' rollouts [s].
       dt: their step [s].
-      spare_rate: steps beyond those in each second, for crossings [1/s].
+      spare_rate: additional steps per second, for located crossings [1/s].
       width: of the target [rad and m].
-      variety: how many of the best candidates the tunings begin from, in turn.
-      judge_every: steps after which all controllers are judged.
-      exchange_from: the share of the steps after which each tuning then goes on from the best that was met.
-      judging: starts by which they are.
-      semifinal: starts by which the best of a front are compared once more: who was lucky with few is not with many.
-      final: unseen starts that the points of a front are measured from.
-      horizon: of all runs that judge [s].
-      judging_dt: step and control period of screening and judging [s].
-      final_dt: of semifinal and final [s].
-      success: share of the starts that a point must settle from in both.
+      variety: number of the best candidates from which the tunings begin, in turn.
+      judge_every: steps between evaluations of all tunings' controllers.
+      exchange_from: share of the steps after which, at each evaluation, tunings continue from the archive's best.
+      judging: initial states of an evaluation.
+      semifinal: initial states on which a front's best controllers are re-evaluated, to remove selection bias.
+      final: unseen initial states on which the points of a front are measured.
+      horizon: duration of all these evaluations' runs [s].
+      judging_dt: step and control period of screening and evaluations [s].
+      final_dt: step and control period of semifinal and final [s].
+      success: share of the initial states that a point must settle from in semifinal and final.
     """
 
     seed: int = 1

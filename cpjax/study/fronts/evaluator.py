@@ -1,4 +1,4 @@
-"""What many controllers are worth, and which of them to go on from: the judge of a search for trade-off fronts."""
+"""Evaluation of many controllers, and selection among them, for the search for trade-off fronts."""
 
 import dataclasses
 import math
@@ -26,38 +26,47 @@ from cpjax.tune.parameters import FreeParameters, free_parameters
 Numbers = np.ndarray[Any, Any]
 
 SCREEN, BATCH, JUDGE, SEMIFINAL, FINAL, CANDIDATES, EXPLORE = range(7)
-"""What random numbers are for."""
+"""Purposes of random numbers."""
 
-_RUNS, _CONTROLLERS = 2048, 64  # simulated, and designed, at a time
+_RUNS, _CONTROLLERS = 2048, 64  # batch sizes: runs simulated, and controllers designed, at once
 
 
 class Evaluated(NamedTuple):
-    """Controllers and what they were found to be worth."""
+    """n controllers and their metrics."""
 
     vectors: Numbers
-    """Free parameters (n, d)."""
+    """Free parameters, unconstrained (n, d)."""
     success: Numbers
-    """Share of the starts that they settle from (n,)."""
+    """Share of the initial states that each settles from (n,)."""
     time: Numbers
-    """Mean settling time of those [s] (n,), infinite where there is none."""
+    """Mean settling time over those [s] (n,); infinite if there is none."""
     costs: Numbers
-    """Likewise the mean `COSTS` (n, number of them)."""
+    """Mean of each of `COSTS` over those (n, number of costs); infinite if there is none."""
 
     def points(self, cost: str, success: float) -> Numbers:
-        """Settling time and cost (n, 2); infinite for those that settle from a smaller share of the starts."""
+        """Returns settling time and cost (n, 2); infinite for those that settle from a smaller share than `success`."""
         found = np.stack([self.time, self.costs[:, COSTS.index(cost)]], axis=1)
         found[self.success < success] = np.inf
         return found
 
     def enough(self, wanted: float) -> float:
-        """The share of starts to ask for: `wanted` if any settles from so many, or else nearly as many as the best."""
+        """Returns the success threshold: `wanted` if any controller reaches it, else 97 % of the largest share."""
         best = float(np.max(self.success))
         return wanted if best >= wanted else 0.97 * best
 
     def fastest(self, cost: str, bound: float, success: float, rank: int = 0) -> tuple[Numbers, float]:
-        """Of the controllers that settle from `success` of the starts, or nearly as many as the best, the fastest that
-        keeps to the bound, and its time; if there is none, the cheapest, and infinity. Or the second such, the third,
-        and so on, by `rank`, if there are so many.
+        """Returns the fastest controller within a bound on a cost, and its settling time.
+
+        If none is within the bound, returns the one with the least cost, and infinity.
+
+        Args:
+          cost: one of `COSTS`.
+          bound: largest mean cost.
+          success: wanted share of the initial states; see `enough`.
+          rank: 0 for the best, 1 for the second, and so on; at most the last.
+
+        Returns:
+          Free parameters (d,) and mean settling time [s].
         """
         time, spent = self.points(cost, self.enough(success)).T
         within = np.flatnonzero((spent <= bound) & np.isfinite(time))
@@ -67,7 +76,7 @@ class Evaluated(NamedTuple):
         return self.vectors[found], float(time[found]) if len(within) else math.inf
 
     def epsilon_grid(self, cost: str, plan: FrontConfig) -> Numbers:
-        """Bounds of a cost (bounds + 1,)."""
+        """Returns bounds on a cost (bounds + 1,), see `FrontConfig.bounds`; the last one is infinite."""
         points = self.points(cost, self.enough(plan.success))
         points = points[np.isfinite(points[:, 0])]
         if not len(points):
@@ -77,10 +86,10 @@ class Evaluated(NamedTuple):
 
 
 class Evaluator:
-    """Builds one design's controllers of their free parameters, at any supply, and counts what it costs to judge them.
+    """Builds and evaluates one design's controllers at any supply, and counts the steps simulated.
 
     Attributes:
-      free: what may change, about the bland start.
+      free: the free parameters of the baseline controller.
       steps: Runge-Kutta steps simulated so far, by supply [V].
     """
 
@@ -91,11 +100,11 @@ class Evaluator:
         self._built = jax.jit(jax.vmap(lambda vector, supply: without_design(self.free_at(supply).build(vector))))
 
     def plant_at(self, supply: Any) -> CartPole:
-        """The plant at a supply [V]."""
+        """Returns the plant with another voltage limit [V]."""
         return with_parameters(self._plant, {"voltage_limit": supply})
 
     def free_at(self, supply: Any) -> FreeParameters:
-        """The free parameters of controllers whose law knows this supply [V]."""
+        """Returns the free parameters of controllers whose law's model has this voltage limit [V]."""
         controller = self.free.controller
         law = controller.swing_up
         assert isinstance(law, EnergySwingUp)
@@ -103,12 +112,19 @@ class Evaluator:
         return dataclasses.replace(self.free, controller=dataclasses.replace(controller, swing_up=law))
 
     def starts(self, count: int, purpose: int, number: int = 0) -> State:
-        """Starts that no person's seed names."""
+        """Draws initial states (count,) of the set "hanging", with a seed derived from purpose and number."""
         seed = derive_seed(self._plan.seed, purpose, number)
         return sample_starts("hanging", count, seed=seed, dtype=np.dtype(jnp.result_type(float)))
 
     def evaluate(self, vectors: Numbers, supply: float, count: int, purpose: int) -> Evaluated:
-        """Controllers (n, d) by the protocol's metrics from so many starts, all the same."""
+        """Evaluates controllers by the protocol's metrics, all from the same initial states.
+
+        Args:
+          vectors: free parameters (n, d).
+          supply: voltage limit [V].
+          count: number of initial states.
+          purpose: `SEMIFINAL` and `FINAL` use `final_dt`, others `judging_dt`; each has its own initial states.
+        """
         plan, plant, starts = self._plan, self.plant_at(supply), self.starts(count, purpose)
         dt = plan.final_dt if purpose in (SEMIFINAL, FINAL) else plan.judging_dt
         controllers = in_blocks(self._built, _CONTROLLERS, vectors, np.full(len(vectors), supply, vectors.dtype))
@@ -138,15 +154,20 @@ class Evaluator:
         return Evaluated(vectors, total / count, mean(table.settling_time), costs)
 
     def begin(self, supply: float, count: int, number: int) -> Evaluated:
-        """The bland start and `count` random candidates from ranges that suit the supply; the better ones of each cost
-        judged on more starts."""
+        """Screens the baseline controller and random candidates, and evaluates the better ones for each cost.
+
+        Args:
+          supply: voltage limit [V], which the candidates' ranges suit.
+          count: number of random candidates.
+          number: distinguishes independent draws.
+        """
         plan = self._plan
         random = np.random.default_rng([plan.seed, CANDIDATES, number])
         free = free_parameters(baseline(self._design, self.plant_at(supply)))
-        bland = np.asarray(self.free.start())[None]
-        gentle = count // 2  # who pumps gently, in more swings, needs less room
+        given = np.asarray(self.free.start())[None]
+        gentle = count // 2  # lower energy gains: more swings, less cart travel
         draws = free.draw(random, count - gentle), free.draw(random, gentle, short_track=True)
-        drawn = np.concatenate([bland, *draws]).astype(bland.dtype)
+        drawn = np.concatenate([given, *draws]).astype(given.dtype)
         screened = self.evaluate(drawn, supply, plan.screening, SCREEN)
         better: set[int] = {0}
         for cost in COSTS:
@@ -157,8 +178,11 @@ class Evaluator:
 
 
 def nondominated_sort(points: Numbers, least: int) -> Numbers:
-    """Indices of the points (n, 2) that no other beats, then of those that only they beat, and so on, until there are
-    `least` or no more that are finite; the first point if none is.
+    """Returns indices of points by non-dominated sorting: the first fronts that together hold at least `least` points.
+
+    Args:
+      points: two costs of each point (n, 2); points that are not finite are left out.
+      least: wanted number of points; fewer if there are not so many. The first point alone if none is finite.
     """
     left, chosen = np.array(points), np.zeros(0, int)
     while len(chosen) < least and len(layer := nondominated(left)):
@@ -168,5 +192,5 @@ def nondominated_sort(points: Numbers, least: int) -> Numbers:
 
 
 def concatenate(parts: list[Evaluated]) -> Evaluated:
-    """All controllers of several lists."""
+    """Returns all controllers of several lists as one."""
     return Evaluated(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))

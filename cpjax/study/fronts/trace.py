@@ -1,15 +1,15 @@
-"""What settling faster costs: trade-off fronts of a design, traced by gradients, and by random search for comparison.
+"""Trade-off fronts between settling time and a cost: traced by gradients, and by random search for comparison.
 
-Every point is a hybrid controller. Random candidates, judged by values, are where the search begins. Then many tunings
-go side by side under one `vmap`: each minimises the time outside the target while the mean of one cost stays below a
-bound, for a ladder of bounds, every cost, and every supply (epsilon constraints, Haimes and others, 1971), by a price
-that rises while the cost exceeds its bound and falls while it does not (Arrow, Hurwicz and Uzawa, 1958). Now and then
-all are judged by the protocol's metrics, and each goes on from the fastest controller met so far that keeps to its
-bound. Of all that were judged, those that no other beats are the front. The random search draws candidates until it has
-simulated as many Runge-Kutta steps at each supply, a gradient's counted as the measured multiple of a value's.
+Every point is a hybrid controller. The search begins with random candidates, evaluated by values. Then many tunings run
+in parallel under one `vmap`: each minimises the time outside the target while the mean of one cost stays below a bound,
+for a grid of bounds, every cost, and every supply (epsilon constraints, Haimes and others, 1971). A multiplier rises
+while the cost exceeds its bound and falls while it does not (Arrow, Hurwicz and Uzawa, 1958). At intervals all are
+evaluated by the protocol's metrics, and each continues from the fastest controller of the archive within its bound. The
+non-dominated controllers of the archive are the front. The random search draws candidates until it has simulated as
+many Runge-Kutta steps at each supply, where a gradient's step counts as the measured multiple of a value's.
 
-What is steered and what is judged differ: a price follows the mean cost of a few starts over a short run, on the
-continuous clock and failures included; a bound is kept by the mean over the successes, by the protocol.
+The multiplier and the evaluation use different means: a multiplier follows the mean cost of a few initial states over a
+short run, on the continuous clock and failures included; a bound applies to the protocol's mean over the successes.
 """
 
 import dataclasses
@@ -53,22 +53,22 @@ from cpjax.tune.objective import Effort, Lagrangian, RemainingTime, Travel, Volt
 Numbers = np.ndarray[Any, Any]
 Report = Callable[[int, int, str], None]
 GRADIENT_STEP = 60.0
-"""Steps of the fastest values that take as long as one of a gradient of these tunings (`experiments/tuner_cost.py`)."""
+"""Steps of values on the fastest path that take as long as one gradient step here (`experiments/tuner_cost.py`)."""
 
 FOLDS: Mapping[str, Any] = {"effort": Effort(), "cart_travel": Travel(), "voltage_variation": VoltageVariation()}
-"""What is differentiable of each of `COSTS`."""
+"""Differentiable metric for each of `COSTS`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Front:
-    """Of one cost, one supply and one way to search.
+    """Front of one cost and one supply, from one kind of search.
 
     Attributes:
-      points: mean settling time [s] and mean cost (n, 2), over the successes among the last starts; by rising time.
-      success: share of those starts (n,).
-      vectors: the controllers' free parameters (n, d).
-      volume: the hypervolume up to the reference.
-      best_success: the greatest share of the semifinal's starts that any controller settled from.
+      points: mean settling time [s] and mean cost (n, 2) over the successes of the final evaluation; by rising time.
+      success: share of the final evaluation's initial states that each settles from (n,).
+      vectors: the controllers' free parameters, unconstrained (n, d).
+      volume: hypervolume up to the reference point.
+      best_success: the largest share of the semifinal's initial states that any controller settles from.
     """
 
     points: Numbers
@@ -80,14 +80,14 @@ class Front:
 
 @dataclasses.dataclass(frozen=True)
 class Fronts:
-    """Of one design.
+    """Fronts of one design.
 
     Attributes:
-      traced: by gradients: (supply [V], cost) to front.
-      random: by random search, likewise.
-      steps: for each supply the Runge-Kutta steps of values and of gradients that the tracing took, and of the random
-        search.
-      seconds: that everything took, also what an interrupted call did before.
+      traced: fronts found by gradients, by (supply [V], cost).
+      random: fronts found by random search, likewise.
+      steps: for each supply [V] the Runge-Kutta steps of values ("values") and of gradients ("gradients") of the search
+        by gradients, and those of the random search ("random").
+      seconds: wall time, with that of cached searches [s].
     """
 
     traced: dict[Lane, Front]
@@ -106,14 +106,17 @@ def trace_fronts(
     report: Report,
     memory: Path | None = None,
 ) -> Fronts:
-    """The fronts of settling time against every cost at the plant's own supply, and against effort at others.
+    """Traces the fronts of settling time against every cost at the plant's own supply, and against effort at others.
 
     Args:
-      reference: of the hypervolumes; see `front_yardstick`.
+      plant: the plant.
+      design: "lqr" or "placement".
+      plan: the configuration.
+      reference: reference points of the hypervolumes (2,) by (supply, cost); see `reference_points`.
       supplies: further voltage limits [V].
-      report: called with the parts done, their number, and what they are.
-      memory: a folder in which each of the two searches is saved when it is done. A call that finds one there goes on
-        from it; the folder is to be that of the same plant, design, plan and supplies.
+      report: called with the parts done, their number, and the current part in words.
+      memory: a folder in which each of the two searches is cached when it is done. A call that finds one there does not
+        repeat it; the folder must be that of the same plant, design, plan and supplies.
 
     Raises:
       InputError: a plant without a voltage limit.
@@ -134,7 +137,7 @@ def trace_fronts(
         return Search(met, counts, evaluator.steps, tracer.steps, time.perf_counter() - begin)
 
     def draw() -> Search:
-        # For each supply as much work; as many as the tracing's are judged a second time, the rest goes into screening.
+        # As much work for each supply as tracing; as many candidates are evaluated further, the rest is screening.
         begin = time.perf_counter()
         evaluator.steps = Counter()
         drawn = {}
@@ -172,8 +175,8 @@ def trace_fronts(
 def _front(
     evaluator: Evaluator, plan: FrontConfig, met: Evaluated, supply: float, cost: str, reference: Numbers
 ) -> Front:
-    """Of all controllers met, those that no other beats, measured once more from unseen starts."""
-    # Few starts say little about one failure in a hundred: who failed a few of them may run in the semifinal.
+    """Returns the front of all controllers met, measured once more from unseen initial states."""
+    # Few initial states do not resolve a failure rate of 1 %: controllers with a few failures enter the semifinal too.
     lenient = met.enough(1.0 - 3.0 * (1.0 - plan.success))
     chosen = np.unique(
         np.concatenate([nondominated_sort(met.points(cost, share), 3 * plan.bounds) for share in (1.0, lenient)])
@@ -193,21 +196,22 @@ def _front(
 
 
 class Aim(NamedTuple):
-    """What one tuning of many minimises, and on what."""
+    """Objective of one tuning: multipliers and supply."""
 
     prices: jax.Array
-    """Of a unit of each of `COSTS` [s]; zero for all but one."""
+    """Multiplier of each of `COSTS` [s per unit of the cost]; zero but for the one that has a finite bound."""
     supply: jax.Array
-    """[V]."""
+    """Voltage limit [V]."""
 
 
 class Tracer:
-    """One design's tunings, side by side.
+    """Runs one design's tunings in parallel.
 
     Attributes:
       steps: Runge-Kutta steps of all gradients, by supply [V].
-      steps_of_a_run: those of one start.
-      gradient: slopes (n, d) and mean costs (n, number of `COSTS`) of controllers (n, d), aims (n,) and starts.
+      steps_of_a_run: Runge-Kutta steps of one run.
+      gradient: compiled map from free parameters (n, d), aims (n,) and initial states (m,) to gradients (n, d) and mean
+        costs (n, number of `COSTS`).
     """
 
     def __init__(self, evaluator: Evaluator, plan: FrontConfig) -> None:
@@ -227,18 +231,24 @@ class Tracer:
     def trace(
         self, begun: dict[float, Evaluated], fronts: list[Lane], report: Callable[[int, str], None]
     ) -> dict[float, Evaluated]:
-        """All controllers met, by supply: what `begun` has, and all that were judged on the way."""
+        """Runs all tunings and returns the archive: the controllers of `begun` and all evaluated on the way, by supply.
+
+        Args:
+          begun: evaluated candidates, by supply [V].
+          fronts: the pairs of supply [V] and cost that are traced.
+          report: called with the steps done and the current work in words.
+        """
         plan = self._plan
         jobs = [(supply, cost, bound) for supply, cost in fronts for bound in begun[supply].epsilon_grid(cost, plan)]
-        # Every device has as many tunings: the last is done more than once if need be.
+        # Every device runs the same number of tunings: the last one is repeated if necessary.
         jobs += [jobs[-1]] * (-len(jobs) % len(jax.devices()))
         bounds = np.full((len(jobs), len(COSTS)), np.inf)
         for row, (_, cost, bound) in enumerate(jobs):
             bounds[row, COSTS.index(cost)] = bound
         supplies = np.array([supply for supply, _, _ in jobs])
         first = [begun[job[0]].fastest(*job[1:], plan.success, row % plan.variety)[0] for row, job in enumerate(jobs)]
-        vectors = self._placed(np.stack(first))  # as each step leaves them: otherwise the gradient is compiled twice
-        prices = np.where(np.isfinite(bounds), plan.price, 0.0)  # of a bound's worth of each cost
+        vectors = self._placed(np.stack(first))  # sharded as after a step, else the gradient is compiled twice
+        prices = np.where(np.isfinite(bounds), plan.price, 0.0)  # multipliers of costs in units of their bounds
         state = self._optimiser.init(vectors)
         met = dict(begun)
         random = np.random.default_rng([plan.seed, EXPLORE])
@@ -270,7 +280,7 @@ class Tracer:
         return met
 
     def _slope(self, vector: jax.Array, aim: Aim, starts: State) -> tuple[jax.Array, jax.Array]:
-        """Of the mean over the starts, no start's sensitivity drowning the others'; and the mean costs."""
+        """Returns the gradient (d,), norm-clipped per initial state and then averaged; and the mean costs."""
         plan, plant, free = self._plan, self._judge.plant_at(aim.supply), self._judge.free_at(aim.supply)
         costs = (FOLDS[cost] for cost in COSTS)
         terms = (TimeOutside(plan.width, plan.width), *costs, RemainingTime(plan.duration))
@@ -297,5 +307,5 @@ class Tracer:
 
 
 def _forgotten(leaf: jax.Array, rows: Numbers) -> jax.Array:
-    """An optimiser's memory without that of some rows."""
+    """Returns a leaf of the optimiser's state with some rows of its moments reset to zero."""
     return jnp.where(rows[:, None], 0.0, leaf).astype(leaf.dtype) if leaf.ndim == 2 else leaf
