@@ -53,7 +53,7 @@ def integer(name: str, value: Any) -> jax.Array:
 def _scalar(name: str, value: Any, allowed: str, *kinds: Any, dtype: Any) -> jax.Array:
     try:
         array = jnp.asarray(value)
-    except (TypeError, ValueError) as problem:
+    except (TypeError, ValueError, OverflowError) as problem:
         raise InputError(name, _kind_of(value), allowed) from problem
     if array.shape != () or not any(jnp.issubdtype(array.dtype, kind) for kind in kinds):
         raise InputError(name, f"array of shape {array.shape} and dtype {array.dtype}", allowed)
@@ -77,6 +77,26 @@ def like(name: str, value: Any, expected: Any) -> Any:
             where = f"{name}{jax.tree_util.keystr(path)}"
             allowed = f"of shape {there.shape} and dtype {there.dtype}, as before"
             raise InputError(where, f"array of shape {here.shape} and dtype {here.dtype}", allowed)
+    return value
+
+
+def arrays(name: str, value: Any, *, keys: bool = True) -> Any:
+    """Returns a tree that a component returned, after checking that JAX takes each of its leaves as an array.
+
+    Args:
+      keys: whether leaves may be random keys (`jax.random.key`).
+
+    Raises:
+      InputError: a leaf is neither a number nor an array of numbers or random keys; it is named.
+    """
+    for path, leaf in jax.tree_util.tree_leaves_with_path(value):
+        where = f"{name}{jax.tree_util.keystr(path)}"
+        try:
+            array = jnp.asarray(leaf)
+        except (TypeError, ValueError, OverflowError) as problem:
+            raise InputError(where, _kind_of(leaf), "a number or an array of numbers") from problem
+        if not keys and jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+            raise InputError(where, "a random key", "a number or an array of numbers")
     return value
 
 

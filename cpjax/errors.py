@@ -7,7 +7,7 @@ class InputError(ValueError):
     """A value from outside (an argument, a file, an option) that the library cannot use.
 
     Attributes:
-      field: where the value was given, as the user wrote it (``CartPole.cart_mass``, ``dt``, ``plant.toml: [motor] mass``).
+      field: where the value was, as the user wrote it (``CartPole.cart_mass``, ``dt``, ``plant.toml: [motor] mass``).
       value: the value itself.
       allowed: what is accepted, with its unit.
     """

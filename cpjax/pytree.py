@@ -79,7 +79,7 @@ class Number:
 
     @property
     def scales(self) -> bool:
-        """Whether the range contains every positive number, so that a value may be multiplied by any positive factor."""
+        """Whether the range contains all positive numbers, so that a value may be multiplied by any positive factor."""
         return max(self.above, self.at_least) <= 0.0 and min(self.below, self.at_most) == math.inf
 
     def allowed(self) -> str:
@@ -255,8 +255,7 @@ def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
     """Refuses a component that no rollout can run, because JAX may have rebuilt it with arbitrary leaves.
 
     Fields with a declared rule, and those annotated as `Scalar`, are checked against it. Everything else that a user's
-    own component holds (arrays of any shape, trees of them, functions) is accepted as it is; random keys
-    (`jax.random.key`) may come as one for each initial state.
+    own component holds (arrays of any shape, trees of them, functions) is accepted as it is.
 
     Args:
       name: the component's name in error messages.
@@ -278,7 +277,7 @@ def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
         if is_component(node):
             batched += _check_fields(where, node, batch)
         elif is_number(node):
-            batched.append(_is_key(node) and node.shape == (batch,))
+            batched.append(False)
         elif not (path and _is_choice(node)):
             allowed = (
                 "a number; a class of your own is made a component by the decorator cpjax.pytree.pytree, or by "
@@ -430,7 +429,7 @@ def _cast(leaf: Any, dtype: Any) -> Any:
 
 
 def as_array(value: Any, dtype: Any) -> Array:
-    """Converts a value like `jnp.asarray`, but keeps values from outside JAX in NumPy and returns matching arrays as is.
+    """Converts like `jnp.asarray`, but leaves values from outside JAX in NumPy and returns matching arrays unchanged.
 
     A rollout is called with dozens of numbers, and this takes a tenth of the time.
     """

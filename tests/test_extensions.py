@@ -419,11 +419,29 @@ def test_a_random_key_may_be_part_of_a_controller_and_of_its_memory(make):
     )
 
 
-def test_each_initial_state_may_have_a_random_key_of_its_own():
+def test_each_initial_state_may_have_a_random_key_of_its_own_through_vmap():
     law, keys = paper.regulator("lqr", "printed", PLANT), jax.random.split(jax.random.key(1), 3)
     start = cpjax.State(0.0, 0.0, 0.1, 0.0)
-    starts = jax.tree.map(lambda value: np.full(3, value), start)
-    swept = cpjax.sweep(PLANT, Dithering(law, keys), starts, **RUN)
+    mapped = jax.vmap(lambda key: cpjax.measure(PLANT, Dithering(law, key), start, **RUN).effort)(keys)
     alone = [float(cpjax.measure(PLANT, Dithering(law, key), start, **RUN).effort) for key in keys]
-    np.testing.assert_allclose(swept.effort, alone, rtol=1e-9)
+    np.testing.assert_allclose(mapped, alone, rtol=1e-9)
     assert len(set(alone)) == 3
+
+
+@cpjax.pytree.pytree
+class ThreeKeys:
+    """Holds three random keys, and uses the first."""
+
+    keys: jax.Array
+
+    def init(self, measurement):
+        return ()
+
+    def update(self, memory, measurement):
+        return memory, jax.random.normal(self.keys[0], dtype=measurement.x.dtype)
+
+
+def test_as_many_keys_as_initial_states_are_still_one_field():
+    controller = ThreeKeys(jax.random.split(jax.random.key(1), 3))
+    efforts = [cpjax.sweep(PLANT, controller, many(cpjax.HANGING, count), **RUN).effort for count in (2, 3)]
+    np.testing.assert_allclose(efforts[1], np.full(3, efforts[0][0]), rtol=1e-9)

@@ -57,7 +57,7 @@ def single_kernel(function: Callable[..., Any], *, stacks: bool = False) -> Call
 
 
 def outline(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Wraps `function` so that it stays a separate function where the compiler would otherwise recompute its results."""
+    """Wraps `function` so that it stays a function of its own where the compiler would otherwise recompute it."""
     return function if runtime.compiler_fuses_loops() else _called(function, _part, False)
 
 

@@ -1,1 +1,1 @@
-"""cpjax's plants and controllers in the terms of other packages; each bridge is imported by whoever wants it."""
+"""Conversions of cpjax's plants and controllers for other packages; each bridge is imported only on request."""

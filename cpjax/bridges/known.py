@@ -1,4 +1,4 @@
-"""What a bridge takes: numbers that are known, as other packages cannot be traced by JAX."""
+"""Argument checks of the bridges: numbers must be concrete, because JAX cannot trace through other packages."""
 
 from typing import Any
 
@@ -14,16 +14,16 @@ EXPRESSED = (
     *("torque_constant", "back_emf_constant", "resistance", "rotor_inertia", "viscous_friction"),
     *("wheel_radius", "gear_ratio", "voltage_limit"),
 )
-"""Parameters of plant and motor that the bridges' own formulas hold."""
+"""Parameters of plant and motor that the bridges' own formulas contain."""
 
 UNTRACEABLE = "JAX cannot trace through another package"
 
 
 def concrete_plant(plant: Any) -> CartPole:
-    """`plant` with Python's floats for numbers; a matrix of somebody's own motor stays an array.
+    """Returns `plant` with Python floats as numbers; an array in a user's own motor stays an array.
 
     Raises:
-      InputError: it is no CartPole, or JAX is tracing a number of it.
+      InputError: `plant` is not a CartPole, or JAX is tracing a number of it.
     """
     if not isinstance(plant, CartPole):
         raise InputError("plant", plant, "a cpjax.CartPole")
@@ -32,13 +32,13 @@ def concrete_plant(plant: Any) -> CartPole:
 
 
 def unexpressed(part: Any) -> dict[str, Number]:
-    """The numbers of a plant or motor beyond `EXPRESSED` that are not neutral: no formula of a bridge holds them."""
+    """Returns the non-neutral numbers of a plant or motor beyond `EXPRESSED`: no formula of a bridge contains them."""
     declared = numbers(type(part)).items()
     return {name: rule for name, rule in declared if name not in EXPRESSED and getattr(part, name) != rule.neutral}
 
 
 def require_concrete(name: str, tree: Any) -> None:
-    """Raises InputError unless the fields of `tree` are in range and their numbers known."""
+    """Raises InputError unless the fields of `tree` are in range and their numbers concrete."""
     check(name, tree)
     if any(is_traced(leaf) for leaf in jax.tree.leaves(tree)):
         raise InputError(name, tree, f"of known numbers; {UNTRACEABLE}")

@@ -1,4 +1,4 @@
-"""The plant as a model of MuJoCo, in its own format; MuJoCo itself is not imported."""
+"""Conversion of the plant to a model in MuJoCo's XML format; MuJoCo itself is not imported."""
 
 import math
 from typing import Literal
@@ -9,12 +9,12 @@ from cpjax.plant import CartPole, Motor
 from cpjax.pytree import Number
 
 LEAST_INERTIA = 1e-9
-"""MuJoCo asks for some inertia of a point bob: this much [kg m^2]."""
+"""Inertia given to a point bob, as MuJoCo requires one [kg m^2]."""
 
 _STEP = Number("s", "integration step", above=0.0)
 
-# Positive theta leans towards negative x: a turn about -y. The wheels' force is an actuator on the cart's slide, what
-# the back-EMF and the bearings take is damping of that slide, and the rotor is its armature.
+# Positive theta leans towards negative x: a rotation about -y. The wheels' force is an actuator on the cart's slide
+# joint, back-EMF and bearing friction are damping of that joint, and the rotor's inertia is its armature.
 _MODEL = """
 <mujoco model="cart_pole">
   <option timestep="{dt}" integrator="{integrator}" gravity="0 0 -{gravity}"/>
@@ -39,18 +39,19 @@ _MODEL = """
 def model_xml(
     plant: CartPole, dt: float, integrator: Literal["RK4", "Euler", "implicit", "implicitfast"] = "RK4"
 ) -> str:
-    """The plant for `mujoco.MjModel.from_xml_string`.
+    """Returns the plant as XML for `mujoco.MjModel.from_xml_string`.
 
-    Joints x and theta in cpjax's sense and units (qpos, qvel); one control, the voltage [V], which MuJoCo clips as the
-    motor does. A point bob gets the inertia `LEAST_INERTIA`.
+    Joints x and theta have cpjax's signs and units (qpos, qvel); the one control is the voltage [V], which MuJoCo clips
+    as the motor does. A point bob gets the inertia `LEAST_INERTIA`.
 
     Args:
+      plant: a plant with concrete numbers.
       dt: integration step [s].
-      integrator: MuJoCo's name of it.
+      integrator: MuJoCo's name of the integrator.
 
     Raises:
-      InputError: the class of `plant` or of its motor is not cpjax's own; a parameter that the model does not hold is
-        not zero (or what is declared neutral); a number is not known; dt is not positive.
+      InputError: the class of `plant` or of its motor is not cpjax's own; a parameter that the model does not contain
+        is not at its neutral value (zero unless declared); a number is not concrete; dt is not positive.
     """
     plant = concrete_plant(plant)
     motor = plant.motor
@@ -60,7 +61,7 @@ def model_xml(
         for name, rule in unexpressed(part).items():
             allowed = f"{rule.neutral:g} [{rule.unit}]; this MuJoCo model cannot express any other"
             raise InputError(f"{path}.{name}", getattr(part, name), allowed)
-    turns = motor.gear_ratio / motor.wheel_radius  # rotor radians per metre
+    turns = motor.gear_ratio / motor.wheel_radius  # rotor angle per cart travel [rad/m]
     numbers: dict[str, object] = {
         "dt": float(_STEP.normalise("dt", dt)),
         "gravity": plant.gravity,

@@ -1,9 +1,9 @@
-"""The plant, the closed loop and the gain as objects of python-control, and its gains as laws.
+"""Conversion of plant, closed loop and gain to objects of python-control, and of its gains to laws.
 
-Signals carry cpjax's names and units: states x, x_dot, theta, theta_dot, input voltage. The equations of motion are
-`CartPole.acceleration`, evaluated in Python's floats: for one state at a time, as python-control's simulations ask for
-them, that takes a fraction of a call into JAX. Linear models, laws and gates do come out of JAX, in its default dtype:
-turn on float64.
+Signals have cpjax's names and units: states x, x_dot, theta, theta_dot, input voltage. The equations of motion are
+`CartPole.acceleration`, evaluated in Python floats: python-control's simulations take one state at a time, for which
+that costs a fraction of a call into JAX. Linear models, laws and gates are computed by JAX, in its default dtype: turn
+on float64.
 """
 
 import math
@@ -31,7 +31,7 @@ from cpjax.sim.stepper import applied_voltage, step_held
 Vector: TypeAlias = np.ndarray[Any, Any]
 
 MEASURED = ("x", "theta")
-"""What the paper measures, cart position and angle: the `outputs` of `state_space` when an observer is to follow."""
+"""The paper's measurements, cart position and angle: `outputs` of `state_space` for the design of an observer."""
 
 _PERIOD = Number("s", "control period", above=0.0)
 
@@ -41,14 +41,16 @@ def state_space(
     equilibrium: Literal["upright", "hanging"] | State = "upright",
     outputs: Sequence[str] = NAMES,
 ) -> control.StateSpace:
-    """`cpjax.linearize` as a continuous-time `control.StateSpace` with input voltage, in deviations from `equilibrium`.
+    """Returns the model of `cpjax.linearize` as a continuous-time `control.StateSpace` with the voltage [V] as input.
 
     Args:
-      outputs: names of the states to put out, in order; `MEASURED` are the paper's.
+      plant: a plant with concrete numbers.
+      equilibrium: as for `cpjax.linearize`; the states are deviations from it.
+      outputs: names of the states that are outputs, in order; `MEASURED` are the paper's.
 
     Raises:
-      InputError: as `cpjax.linearize`; a plant or equilibrium that JAX is tracing; an output that is no state, or is
-        named twice.
+      InputError: as for `cpjax.linearize`; a plant or equilibrium that JAX is tracing; an output that is not a state,
+        or is named twice.
     """
     model = linearize(concrete_plant(plant), equilibrium)
     if is_traced(model.A):
@@ -64,12 +66,12 @@ def state_space(
 
 
 def plant_system(plant: CartPole) -> control.NonlinearIOSystem:
-    """The plant: input voltage, outputs and states x, x_dot, theta, theta_dot.
+    """Returns the plant as a system with input voltage [V], outputs and states x, x_dot, theta, theta_dot.
 
-    The motor clips the voltage, as everywhere in cpjax; python-control reports the one that was asked for.
+    The motor clips the voltage, as everywhere in cpjax; python-control reports the demanded one.
 
     Raises:
-      InputError: `plant` is no CartPole with known numbers.
+      InputError: `plant` is not a CartPole with concrete numbers.
     """
     plant = concrete_plant(plant)
     saturate = _saturation(plant.motor)
@@ -85,23 +87,25 @@ def plant_system(plant: CartPole) -> control.NonlinearIOSystem:
 def closed_loop_system(
     plant: CartPole, controller: ModalController | Law, control_period: float | None = None, *, dt: float | None = None
 ) -> control.NonlinearIOSystem:
-    """Plant and controller as one system without inputs. Outputs: the four states, the applied voltage, the mode.
+    """Returns plant and controller as one system without inputs; outputs are the four states, applied voltage and mode.
 
-    Without a control period the system is continuous in time and in what the controller sees; the mode changes at the
-    boundary itself, not at the end of a step as in `cpjax.rollout`. The states are the plant's four.
+    Without a control period the plant and the controller are continuous in time; the mode changes at the boundary
+    itself, not at the end of a step as in `cpjax.rollout`. The states are the plant's four.
 
     With a control period the system is discrete, the sampled clock of `cpjax.rollout`: one update is one period, of
     `control_period / dt` steps of the classical Runge-Kutta method under a held voltage. The states are the plant's
-    four and `mode`, the mode until now; its start is `controller.start_mode`, or simply 0 for a law or `cpjax.Hybrid`.
-    What a rollout would flag and stop is not stopped.
+    four and `mode`, the mode until now, whose initial value is `controller.start_mode`, or 0 for a law or a
+    `cpjax.Hybrid`. A run that a rollout would flag and stop is not stopped.
 
     Args:
-      control_period: [s].
+      plant: a plant with concrete numbers.
+      controller: a law, or a controller whose only memory is its mode.
+      control_period: [s]; None for continuous time.
       dt: the integrator's step [s], a whole fraction of `control_period`; by default all of it.
 
     Raises:
-      InputError: bad arguments, named; `controller` without a control period, if it may remember its mode: laws
-        do not, nor does a `cpjax.Hybrid` whose gate has hysteresis 0.
+      InputError: an argument outside its range; or, without a control period, a `controller` that may remember its
+        mode: laws do not, nor does a `cpjax.Hybrid` whose gate has hysteresis 0.
     """
     plant, controller = concrete_plant(plant), as_controller(controller)
     if not isinstance(controller, ModalController):
@@ -120,13 +124,13 @@ def closed_loop_system(
 
 
 def gain_array(law: StateFeedback) -> Vector:
-    """K of u = -K s as python-control writes it, an array (1, 4) [V per unit of state].
+    """Returns K of u = -K s as python-control writes it, an array (1, 4) [V per unit of state].
 
     The law takes the angle modulo a turn, which a gain cannot: the two agree within half a turn of upright.
 
     Raises:
-      InputError: `law` is no StateFeedback with known numbers, or its reference is not the origin; -K (s - s_ref) is
-        then affine, and no gain.
+      InputError: `law` is not a StateFeedback with concrete numbers, or its reference is not the origin:
+        -K (s - s_ref) is then affine, which no gain represents.
     """
     if not isinstance(law, StateFeedback):
         raise InputError("law", law, "a cpjax.StateFeedback")
@@ -138,20 +142,20 @@ def gain_array(law: StateFeedback) -> Vector:
 
 
 def feedback_system(law: StateFeedback) -> control.StateSpace:
-    """The law as a static system from the states to the voltage, D = -K. Arguments and errors as for `gain_array`."""
+    """Returns the law as a static system from states to voltage, D = -K; arguments and errors as for `gain_array`."""
     return control.StateSpace([], [], [], -gain_array(law), inputs=list(NAMES), outputs=["voltage"])
 
 
 def state_feedback(gain: Any) -> StateFeedback:
-    """The law u = -K s of a gain that python-control computed.
+    """Returns the law u = -K s of a gain that python-control computed.
 
     Args:
-      gain: K (1, 4) or (4,) [V per unit of state], such as the first of what `control.lqr` returns or what
-        `control.place` does; or a static `control.StateSpace` from the four states to one voltage, D = -K, whose inputs
-        may be in any order if they bear the states' names.
+      gain: K (1, 4) or (4,) [V per unit of state], such as the first result of `control.lqr` or the result of
+        `control.place`; or a static `control.StateSpace` from the four states to one voltage, D = -K, whose inputs
+        may be in any order if they have the states' names.
 
     Raises:
-      InputError: anything else, or a gain that is not finite.
+      InputError: another type or shape, or a gain that is not finite.
     """
     if isinstance(gain, control.StateSpace):
         if gain.nstates or gain.D.shape != (1, 4):
@@ -161,7 +165,7 @@ def state_feedback(gain: Any) -> StateFeedback:
     allowed = "an array of shape (1, 4) of known real numbers [V per unit of state]"
     try:
         K = np.asarray(gain)
-    except (TypeError, ValueError) as problem:  # JAX is tracing, or uneven, such as all that control.lqr returns
+    except (TypeError, ValueError) as problem:  # traced, or uneven, such as the whole result of control.lqr
         raise InputError("gain", gain, allowed) from problem
     if K.shape not in ((1, 4), (4,)) or K.dtype.kind not in "fiu":
         raise InputError("gain", gain, allowed)
@@ -169,9 +173,9 @@ def state_feedback(gain: Any) -> StateFeedback:
 
 
 def _derivative(plant: CartPole, state: Vector, voltage: float) -> tuple[Any, ...]:
-    """`vector_field` of any plant under the applied voltage [V], as Python's floats, which the plant must hold too."""
+    """Computes `vector_field` of any plant of Python floats under the applied voltage [V], as Python floats."""
     _, x_dot, theta, theta_dot = state.tolist()
-    # What a plant or motor computes with JAX's functions comes out as arrays: without float64, as float32 ones.
+    # A plant or motor that uses JAX's functions returns arrays; without float64 they would be float32.
     with jax.enable_x64(True):
         force = float(plant.motor.force(voltage, x_dot))
         x_ddot, theta_ddot = plant.acceleration(math.sin(theta), math.cos(theta), (x_dot, theta_dot), force)
@@ -179,7 +183,7 @@ def _derivative(plant: CartPole, state: Vector, voltage: float) -> tuple[Any, ..
 
 
 def _saturation(motor: Motor) -> Callable[[float], float]:
-    """`motor.saturate` for Python's floats; that of cpjax's own motor without a call into JAX. NaN stays NaN."""
+    """Returns `motor.saturate` for Python floats, for cpjax's own motor without a call into JAX; NaN stays NaN."""
     if type(motor) is not Motor or unexpressed(motor):
 
         def saturate(voltage: float) -> float:
@@ -240,7 +244,7 @@ def _sampled_loop(plant: CartPole, controller: ModalController, period: Any, dt:
 def _loop_system(
     update: Callable[..., Any], act: Callable[[Any], jax.Array], states: Sequence[str], dt: float
 ) -> control.NonlinearIOSystem:
-    """`act` gives the applied voltage and the mode at a system's state."""
+    """Builds the closed-loop system; `act` returns the applied voltage and the mode at a system's state."""
 
     def output(t: float, state: Vector, inputs: Vector, params: Any) -> Vector:
         return np.concatenate([state[:4], act(state)])
@@ -252,7 +256,7 @@ def _loop_system(
 
 
 def _may_remember(controller: ModalController) -> bool:
-    """Whether `next_mode` may depend on the mode until now; of a stranger's gate or controller nothing is known."""
+    """Returns whether `next_mode` may depend on the mode until now: unless a law, or a Hybrid with hysteresis 0."""
     if isinstance(controller, SingleLaw):
         return False
     hysteresis = getattr(controller.gate, "hysteresis", None) if isinstance(controller, Hybrid) else None

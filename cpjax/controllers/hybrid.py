@@ -8,10 +8,13 @@ import numpy as np
 
 from cpjax.checks import call, real
 from cpjax.controllers.feedback import StateFeedback
-from cpjax.controllers.gates import Gate
+from cpjax.controllers.gates import AngleGate, AngleRateGate, Gate, LyapunovGate
 from cpjax.controllers.protocol import REGULATE, SWING_UP, Law, ModeMemory, start_memory, update_mode
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, part, pytree
+
+_FINITE_GATES = (AngleGate, AngleRateGate, LyapunovGate)
+"""Gates whose margin is finite for finite states and parameters."""
 
 
 @pytree
@@ -51,7 +54,12 @@ class Hybrid:
             real(f"controller.{name}.voltage", call(f"controller.{name}", getattr(self, name), "voltage", state))
             for name in ("regulator", "swing_up")
         )
-        return jnp.where(mode == REGULATE, regulate, swing_up)
+        voltage = jnp.where(mode == REGULATE, regulate, swing_up)
+        if isinstance(self.gate, _FINITE_GATES):
+            return voltage
+        # A margin that is NaN chooses no mode. So that it does not pass for "outside", the run is to fail.
+        margin = self._gate_margin(state, mode)
+        return jnp.where(jnp.isnan(margin), jnp.asarray(jnp.nan, voltage.dtype), voltage)
 
     def margin(self, state: State, mode: jax.Array) -> Scalar:
         """Returns the gate's margin, with the sign that makes it positive while `mode` lasts."""

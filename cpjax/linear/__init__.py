@@ -1,1 +1,1 @@
-"""From a linear model to a gain, differentiably; and what there is to know about that gain."""
+"""Differentiable design of gains for linear models, and analysis of the resulting loops."""

@@ -1,4 +1,4 @@
-"""What every design function does with its arguments: matrices of one floating dtype, of shapes that fit."""
+"""Argument conversion and checks shared by the design functions: one floating dtype, compatible shapes."""
 
 from collections.abc import Sequence
 from typing import Any, TypeAlias
@@ -11,16 +11,17 @@ from cpjax.errors import InputError
 from cpjax.pytree import Array, is_traced
 
 MatrixLike: TypeAlias = Array | Sequence[Sequence[float]] | Sequence[float] | float
-"""A matrix as an array or a nested list; where one input is meant, as a plain list, or a number for 1 x 1."""
+"""A matrix as an array or a nested list; for one input also as a plain list, or as a number for 1 x 1."""
 
 
 def matrices(**given: Any) -> list[jax.Array]:
-    """The given arrays, nested lists or numbers as JAX arrays of one floating dtype, in order.
+    """Converts the given arrays, nested lists or numbers to JAX arrays of one floating dtype, in order.
 
-    The dtype is the widest among the arrays; lists and whole numbers take it, or JAX's default if there is none.
+    The dtype is the widest among the floating-point arrays; lists and whole numbers take it, or JAX's default if there
+    is none.
 
     Raises:
-      InputError: not real numbers, or a concrete one that is not finite.
+      InputError: values that are not real, a concrete one that is not finite, or a dtype beside float32 and float64.
     """
     allowed = "an array of finite real numbers"
     arrays, dtypes = {}, []
@@ -33,14 +34,14 @@ def matrices(**given: Any) -> list[jax.Array]:
         else:
             try:
                 array = np.asarray(value)
-            except ValueError as problem:  # an uneven nesting
+            except ValueError as problem:  # uneven nesting
                 raise InputError(name, value, allowed) from problem
         kind = array.dtype
         if not jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.complexfloating):
             raise InputError(name, value, allowed)
         if hasattr(value, "dtype") and jnp.issubdtype(kind, jnp.floating):
             dtypes.append(jax.dtypes.canonicalize_dtype(kind))
-        # Whole numbers of any size, before they could wrap around in JAX's own.
+        # Converts whole numbers of any size before they could overflow JAX's integer types.
         whole = not is_traced(array) and jnp.issubdtype(kind, jnp.integer)
         arrays[name] = np.asarray(array, dtype=np.float64) if whole else array
     dtype = np.result_type(*dtypes) if dtypes else jnp.result_type(float)
@@ -54,10 +55,10 @@ def matrices(**given: Any) -> list[jax.Array]:
 
 
 def square(name: str, matrix: jax.Array) -> int:
-    """The size of a square matrix.
+    """Returns the size n of a square matrix (n, n).
 
     Raises:
-      InputError: it is not square, or empty.
+      InputError: the matrix is not square, or is empty.
     """
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or matrix.shape[0] == 0:
         allowed = "a square matrix of shape (n, n); batches go through jax.vmap"
@@ -76,7 +77,7 @@ def shaped(name: str, matrix: jax.Array, shape: tuple[int, ...]) -> None:
 
 
 def columns(name: str, matrix: jax.Array, n: int) -> jax.Array:
-    """The inputs' matrix as (n, m), m at least 1; a plain vector (n,) is welcome for one input.
+    """Returns the input matrix as (n, m), m at least 1; a plain vector (n,) is taken as that of one input.
 
     Raises:
       InputError: another shape.
@@ -89,7 +90,7 @@ def columns(name: str, matrix: jax.Array, n: int) -> jax.Array:
 
 
 def rows(name: str, matrix: jax.Array, n: int) -> jax.Array:
-    """Returns the outputs' matrix, or a gain, as (p, n), p at least 1; a plain vector (n,) is taken as one row.
+    """Returns the output matrix, or a gain, as (p, n), p at least 1; a plain vector (n,) is taken as one row.
 
     Raises:
       InputError: another shape.
@@ -124,7 +125,7 @@ def input_weight(name: str, matrix: jax.Array, m: int) -> jax.Array:
 
 
 def column(name: str, matrix: jax.Array, n: int) -> jax.Array:
-    """A single input's matrix as (n, 1); a plain vector (n,) is welcome.
+    """Returns the input matrix of a single input as (n, 1); a plain vector (n,) is accepted.
 
     Raises:
       InputError: another shape.

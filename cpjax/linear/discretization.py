@@ -1,6 +1,6 @@
-"""A linear model between control instants: what a held input makes of its state, and what the way there costs.
+"""Zero-order-hold discretisation of a linear model and of a quadratic cost.
 
-With u held, (s, u)' = F (s, u), and the cost of a time t is a quadratic form W(t) in s and u at its beginning:
+With u held, (s, u)' = F (s, u), and the cost over a time t is a quadratic form W(t) in s and u at its beginning:
 
     F = [A B]    C = [Q 0]    E(t) = exp(F t) = [Ad Bd]    W(t) = integral of E' C E from 0 to t
         [0 0]        [0 0]                      [ 0  I]
@@ -8,10 +8,10 @@ With u held, (s, u)' = F (s, u), and the cost of a time t is a quadratic form W(
     exp([-F' C] t) = [E(-t)' G(t)]    W = E' G     (Van Loan, 1978)
         [  0 F]      [  0    E(t)]
 
-The exponential is that of the period halved until F t is below 1; E(2 t) = E(t)^2, W(2 t) = W(t) + E(t)' W(t) E(t) lead
-back. So E(-t), which is huge for a stable model and a long t, never appears, and no digits cancel in W. Nor is JAX's
-scaling relied on: it stops at up to twice the norm that its Pade approximant is good for, where a rotation in float64
-is wrong by 2e-8, and gives NaN beyond 16 squarings.
+The exponential is computed for the period halved until |F t| is below 1; E(2 t) = E(t)^2 and
+W(2 t) = W(t) + E(t)' W(t) E(t) then lead back to the period. So E(-t), which is huge for a stable model and a long t,
+never appears, and no digits cancel in W. JAX's own scaling is not used: it stops at up to twice the norm for which its
+Pade approximant is accurate, where a rotation in float64 is wrong by 2e-8, and gives NaN beyond 16 squarings.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 
 class SampledModel(NamedTuple):
-    """s[k + 1] = A s[k] + B u[k], with u held in between."""
+    """Discrete-time model s[k + 1] = A s[k] + B u[k], with u held in between."""
 
     A: jax.Array
     """Shape (n, n)."""
@@ -43,7 +43,7 @@ class SampledModel(NamedTuple):
 
 
 class SampledCost(NamedTuple):
-    """s[k]' Q s[k] + 2 s[k]' N u[k] + u[k]' R u[k]: the cost of one period, from what it begins with."""
+    """Cost of one period, s[k]' Q s[k] + 2 s[k]' N u[k] + u[k]' R u[k], in state and input at its beginning."""
 
     Q: jax.Array
     """Shape (n, n), symmetric."""
@@ -54,10 +54,10 @@ class SampledCost(NamedTuple):
 
 
 def discretize(A: Any, B: Any, period: Scalar) -> SampledModel:
-    """The model s' = A s + B u at control instants, exactly, with the input held in between (zero-order hold).
+    """Discretises the model s' = A s + B u exactly, with the input held between control instants (zero-order hold).
 
     Errors are at most 8 units of rounding of a matrix's largest entry, times |A| period where that is above 1 (|A| the
-    1-norm; `tests/linear/test_discretization.py`). Differentiable in everything, under `jit` and `vmap` too.
+    1-norm; `tests/linear/test_discretization.py`). Differentiable in all arguments, under `jit` and `vmap` too.
 
     Args:
       A: (n, n) [1/s].
@@ -65,16 +65,16 @@ def discretize(A: Any, B: Any, period: Scalar) -> SampledModel:
       period: above 0 [s].
 
     Raises:
-      InputError: another shape, no finite real numbers, or a period that is not above 0, or so long that the model's
-        response leaves the dtype's range, or |A| period is beyond 2^32. Where JAX traces, a bad number gives NaN
-        or infinity instead.
+      InputError: shapes that do not fit, numbers that are not finite and real, a period that is not above 0, or one so
+        long that the model's response exceeds the dtype's range or |A| period exceeds 2^32. Where JAX traces, a bad
+        number gives NaN or infinity instead.
     """
     A, B, period = _arguments(A, B, period)
     return _finite(period, _model(A, B, period))
 
 
 def discretize_cost(A: Any, B: Any, Q: Any, R: Any, period: Scalar) -> SampledCost:
-    """The integral of s' Q s + u' R u over a period in which u is held, as a quadratic form in s and u at its start.
+    """Integrates s' Q s + u' R u over a period in which u is held, as a quadratic form in s and u at its beginning.
 
     A discrete-time regulator with this cost and the model of `discretize` minimises the continuous integral. As
     accurate and differentiable as `discretize`; only the symmetric parts of Q and R count.
@@ -82,12 +82,12 @@ def discretize_cost(A: Any, B: Any, Q: Any, R: Any, period: Scalar) -> SampledCo
     Args:
       A: (n, n) [1/s].
       B: (n, m), or (n,) for one input.
-      Q: (n, n).
-      R: (m, m), or a number for one input.
+      Q: (n, n), weight of the state.
+      R: (m, m), weight of the input, or a number for one input.
       period: above 0 [s].
 
     Raises:
-      InputError: as `discretize`.
+      InputError: as for `discretize`.
     """
     A, B, period, Q, R = _arguments(A, B, period, Q=Q, R=R)
     n, m = B.shape
@@ -109,7 +109,7 @@ def _model(A: jax.Array, B: jax.Array, period: jax.Array) -> SampledModel:
 def _cost(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, period: jax.Array) -> SampledCost:
     n, m = B.shape
     F, unit = _flow(A, B, period)
-    # W is linear in Q: a large one is brought down to the size of F, so that it asks for no halvings of its own.
+    # W is linear in Q: a large Q is scaled down to the size of F, so that it needs no halvings of its own.
     C = jnp.pad(symmetric(Q) * period, (0, m))
     weight = _power_of_two(_exponent(C), C)
     van_loan = jnp.block([[-transpose(F), C / weight], [jnp.zeros_like(F), F]])
@@ -123,12 +123,12 @@ def _cost(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, period: jax.Ar
 
     _, W = _repeat(double, (E, product(transpose(E), G)), halvings)
     W = weight * symmetric(W)
-    # R's share of the integral is R period, whatever the model does.
+    # R contributes R period to the integral, independent of the model.
     return SampledCost(W[:n, :n], symmetric(R) * period + unit * W[n:, n:] * unit, unit * W[:n, n:])
 
 
 def _flow(A: jax.Array, B: jax.Array, period: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """F times the period, with the input in a unit, the second result, in which B is below 1."""
+    """Returns F times the period, and the unit of the input in which B is below 1."""
     m = B.shape[1]
     period = jnp.where(period > 0, period, jnp.nan)
     unit = _power_of_two(_exponent(B * period), B)
@@ -136,7 +136,7 @@ def _flow(A: jax.Array, B: jax.Array, period: jax.Array) -> tuple[jax.Array, jax
 
 
 def _exponent(matrix: jax.Array) -> jax.Array:
-    """The least e, at least 0, with |matrix| < 2^e in the 1-norm. Has no derivative: it is a choice of units."""
+    """Returns the least e >= 0 with |matrix| < 2^e in the 1-norm; no derivative, because it only chooses units."""
     norm = jnp.max(jnp.sum(jnp.abs(matrix), axis=0))
     return jnp.maximum(jnp.frexp(norm)[1], 0)
 
@@ -147,7 +147,7 @@ def _power_of_two(exponent: jax.Array, like: jax.Array) -> jax.Array:
 
 
 def _repeat(function: Callable[[T], T], value: T, times: jax.Array) -> T:
-    """`function` applied to `value` so many times, up to _MOST_HALVINGS; beyond, NaN. Unlike a loop, differentiable."""
+    """Applies `function` `times` times, NaN above _MOST_HALVINGS; differentiable in reverse, unlike a `while_loop`."""
 
     def body(value: T, index: jax.Array) -> tuple[T, None]:
         return lax.cond(index < times, function, lambda value: value, value), None

@@ -1,10 +1,10 @@
-"""What the voltage limit and the gate leave of a linear design: where it saturates, and a region where it cannot fail.
+"""Saturation and switching-region limits of a linear design.
 
 Inside the clip and the gate the loop is s' = A_K s to first order, and s' P s falls along it. The largest level set
-{s' P s <= level} that stays inside both is one that the linearised loop, once in, never leaves. It says so of the
-linear model; for the plant itself it is a guide, to be checked by rollouts.
+{s' P s <= level} that stays inside both is invariant: the linearised loop, once in it, never leaves it. This holds for
+the linear model; for the plant itself it is a guide, to be checked by rollouts.
 
-Every level asks for a P that is positive definite, and counts its symmetric part only; under jit, another gives NaN.
+Every level requires a positive definite P, of which only the symmetric part counts; under jit, another P gives NaN.
 """
 
 import math
@@ -20,20 +20,36 @@ from cpjax.linear.lyapunov import lyapunov
 from cpjax.numeric.small_matrices import is_positive_definite, linear_solve
 from cpjax.pytree import Number, Scalar, is_traced
 
-_THETA = 2  # where the angle stands in the state
+_THETA = 2  # index of the angle in the state
 _RATE = 3
 
 
 def demanded_voltage(K: MatrixLike, angle: Scalar) -> jax.Array:
-    """Returns |u| [V] that the gain K (1, 4) or (4,) asks for at rest, cart in place, `angle` [rad] from upright."""
+    """Returns |u| [V] that a gain demands with the pole at `angle` from upright and all other states 0.
+
+    Args:
+      K: (1, 4) or (4,) [V per unit of state].
+      angle: from upright, any shape [rad].
+
+    Raises:
+      InputError: K has another shape or is not finite.
+    """
     (K,) = matrices(K=K)
     K = gain_matrix("K", K, 1, 4)
     return jnp.abs(K[0, _THETA] * jnp.asarray(angle, dtype=K.dtype))
 
 
 def saturation_angle(K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
-    """Returns the angle [rad] from upright beyond which, at rest and with the cart in place, the gain K (1, 4) or (4,)
-    asks for more than `voltage_limit` [V]; infinite for a gain that ignores the angle.
+    """Returns the angle [rad] from upright beyond which a gain demands more than the limit, all other states being 0.
+
+    Infinite for a gain that ignores the angle.
+
+    Args:
+      K: (1, 4) or (4,) [V per unit of state].
+      voltage_limit: above 0, may be infinite [V].
+
+    Raises:
+      InputError: K has another shape or is not finite, or a limit that is not above 0.
     """
     (K,) = matrices(K=K)
     K = gain_matrix("K", K, 1, 4)
@@ -60,9 +76,12 @@ def lyapunov_function(A: MatrixLike, B: MatrixLike, K: MatrixLike, Q: MatrixLike
 
 
 def level_within_voltage(P: MatrixLike, K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
-    """The largest level at which |K s| stays within `voltage_limit` [V] wherever s' P s is at most that level.
+    """Returns the largest level for which |K s| stays within `voltage_limit` wherever s' P s is at most that level.
 
-    P is (n, n), K (1, n) or (n,).
+    Args:
+      P: (n, n), symmetric, positive definite.
+      K: (1, n) or (n,) [V per unit of state].
+      voltage_limit: above 0, may be infinite [V].
 
     Raises:
       InputError: shapes that do not fit, a concrete P that is not positive definite, or a limit that is not above 0.
@@ -75,7 +94,11 @@ def level_within_voltage(P: MatrixLike, K: MatrixLike, voltage_limit: Scalar) ->
 
 
 def level_within_angle(P: MatrixLike, half_angle: Scalar) -> jax.Array:
-    """The largest level at which |theta| stays within `half_angle` [rad]: inside an AngleGate. P is (4, 4).
+    """Returns the largest level for which |theta| stays within `half_angle`, the region of an AngleGate.
+
+    Args:
+      P: (4, 4), symmetric, positive definite.
+      half_angle: above 0, at most pi [rad].
 
     Raises:
       InputError: see `level_within_voltage`; or an angle beyond pi.
@@ -87,9 +110,14 @@ def level_within_angle(P: MatrixLike, half_angle: Scalar) -> jax.Array:
 
 
 def level_within_angle_and_rate(P: MatrixLike, half_angle: Scalar, rate: Scalar) -> jax.Array:
-    """The largest level inside an AngleRateGate: (1 - cos theta) / (1 - cos half_angle) + (theta' / rate)^2 <= 1.
+    """Returns the largest level inside an AngleRateGate.
 
-    P is (4, 4), half_angle in rad, rate in rad/s.
+    The gate is (1 - cos theta) / (1 - cos half_angle) + (theta' / rate)^2 <= 1.
+
+    Args:
+      P: (4, 4), symmetric, positive definite.
+      half_angle: above 0, at most pi [rad].
+      rate: above 0 [rad/s].
 
     Raises:
       InputError: see `level_within_angle`.
@@ -103,15 +131,15 @@ def level_within_angle_and_rate(P: MatrixLike, half_angle: Scalar, rate: Scalar)
 
 @jax.jit
 def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -> jax.Array:
-    """The level at which the level set's shadow (2, 2) on angle and rate touches the gate's boundary."""
+    """Returns the level at which the level set's projection on angle and rate (2, 2) touches the gate's boundary."""
     gate = jnp.linalg.inv(shadow), half_angle, rate
-    fixed = lax.stop_gradient(gate)  # the search is not differentiated; the last lines say where the derivative is from
-    # Positions are angles in the plane in which the shadow is about as wide as it is high: however far apart angle and
-    # rate are in size, the level changes over no small part of a turn.
+    fixed = lax.stop_gradient(gate)  # the search is not differentiated; the last lines supply the derivative
+    # Positions are angles in a plane scaled so that the projection is about as wide as it is high: however different
+    # angle and rate are in size, the level then does not vary within a small part of a turn only.
     ratio = half_angle * jnp.sqrt(shadow[1, 1]) / (rate * jnp.sqrt(shadow[0, 0]))
 
     def level(position: jax.Array, form: jax.Array, half_angle: jax.Array, rate: jax.Array) -> jax.Array:
-        """At a point of the boundary, half of which is passed as `position` goes from 0 to pi."""
+        """Returns the level at a point of the boundary; `position` from 0 to pi covers half of it."""
         sin, cos = jnp.sin(position), ratio * jnp.cos(position)
         length = jnp.hypot(sin, cos)
         sin, cos = sin / length, cos / length
@@ -125,12 +153,12 @@ def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -
         positions = middle + width * jnp.linspace(-1.0, 1.0, 129, dtype=shadow.dtype)
         return positions[jnp.argmin(jax.vmap(lambda position: level(position, *fixed))(positions))], width / 64.0
 
-    # The shadow touches the boundary where the level is smallest. A search on grids that narrow down copes with the
-    # corner that a half angle near pi gives the boundary.
+    # The projection touches the boundary where the level is smallest. A search on successively finer grids also handles
+    # the corner that the boundary has for a half angle near pi.
     quarter = jnp.asarray(0.5 * math.pi, dtype=shadow.dtype)
     position, _ = lax.fori_loop(0, 5, narrowed, (quarter, quarter))
-    # By the envelope theorem the minimum's derivative is that at a fixed position. For the second one, the position
-    # moves as a step of Newton's method moves it; where the level is the same everywhere, it need not.
+    # By the envelope theorem the minimum's first derivative is that at a fixed position. For the second derivative the
+    # position moves by a step of Newton's method; where the level is the same everywhere, it stays.
     slope = jax.grad(level)
     bend = jax.grad(slope)(position, *fixed)
     step = slope(position, *gate) / jnp.where(bend > 0.0, bend, 1.0)
@@ -138,9 +166,14 @@ def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -
 
 
 def level_within_form(P: MatrixLike, other: MatrixLike, level: Scalar) -> jax.Array:
-    """The largest level at which s' `other` s stays within `level`: inside a LyapunovGate of another P.
+    """Returns the largest level of P for which s' `other` s stays within `level`, as in another P's LyapunovGate.
 
-    `other` is symmetric, of the shape of P; infinite where it is nowhere positive.
+    Infinite where s' `other` s is nowhere positive.
+
+    Args:
+      P: (n, n), symmetric, positive definite.
+      other: (n, n), symmetric.
+      level: above 0 [1].
 
     Raises:
       InputError: see `level_within_voltage`.
@@ -155,7 +188,7 @@ def level_within_form(P: MatrixLike, other: MatrixLike, level: Scalar) -> jax.Ar
 
 
 def _spread(P: jax.Array, chosen: tuple[int, ...]) -> jax.Array:
-    """The block of P^-1 whose inverse is the quadratic form of the level set's shadow on the chosen coordinates."""
+    """Returns the block of P^-1 whose inverse is the form of the level set's projection on the chosen coordinates."""
     columns = jnp.eye(P.shape[0], dtype=P.dtype)[:, jnp.asarray(chosen)]
     return columns.T @ linear_solve(P, columns)
 
@@ -164,7 +197,7 @@ _is_positive_definite = jax.jit(is_positive_definite)
 
 
 def _positive_definite(name: str, P: jax.Array, size: int | None = None) -> jax.Array:
-    """The symmetric part of a positive definite matrix; NaN for another that is traced."""
+    """Returns the symmetric part of a positive definite matrix; NaN for any other matrix that is traced."""
     n = square(name, P)
     shaped(name, P, (size or n,) * 2)
     P = 0.5 * (P + P.T)
@@ -175,7 +208,7 @@ def _positive_definite(name: str, P: jax.Array, size: int | None = None) -> jax.
 
 
 def _limit(name: str, unit: str, value: Scalar, like: jax.Array, **ends: Any) -> jax.Array:
-    """A scalar above zero, in the dtype of `like`."""
+    """Returns a scalar limit above zero, in the dtype of `like`."""
     limit = jnp.asarray(Number(unit, name, above=0.0, **ends).normalise(name, value), dtype=like.dtype)
     shaped(name, limit, ())
     return limit

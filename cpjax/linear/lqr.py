@@ -9,7 +9,7 @@ from cpjax.linear.riccati import solve_care, solve_dare
 
 
 class LinearQuadratic(NamedTuple):
-    """The gain of u = -K s, and the Riccati solution: s' P s is the least cost of coming to rest from s."""
+    """Gain of u = -K s, and Riccati solution: s' P s is the least cost of bringing s to rest."""
 
     K: jax.Array
     """Shape (m, n)."""
@@ -42,7 +42,7 @@ def lqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLik
 def dlqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> LinearQuadratic:
     """Returns the gain that stabilises s[k+1] = A s[k] + B u[k] and minimises the sum of s' Q s + 2 s' N u + u' R u.
 
-    As `lqr`, with the unit circle in place of the imaginary axis.
+    Arguments and errors as for `lqr`, with the unit circle in place of the imaginary axis.
     """
     P, K, _ = solve_dare(A, B, Q, R, N)
     return LinearQuadratic(K, P)

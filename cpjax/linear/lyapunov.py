@@ -1,10 +1,10 @@
-"""Lyapunov's equation and its discrete-time counterpart, Stein's, for one matrix or a batch, differentiably.
+"""Differentiable solvers of Lyapunov's equation and its discrete-time counterpart, Stein's, also for batches.
 
     A' X + X A + Q = 0            A' X A - X + Q = 0
 
 Both are solved by doubling (Smith, 1968): the sum of A'^k Q A^k over k, with twice as many terms after each step. It
-converges exactly when A is stable, so the iteration is also the test of stability. A correction with the residual in
-double-word arithmetic brings the result to the rounding of the exact solution where the equation's condition allows it.
+converges if and only if A is stable, so the iteration is also the stability test. A correction with the residual in
+double-word arithmetic makes the result the rounded exact solution where the equation's conditioning allows it.
 """
 
 from collections.abc import Callable
@@ -33,18 +33,18 @@ from cpjax.numeric.small_matrices import (
 from cpjax.pytree import is_traced
 
 _MOST_DOUBLINGS = 60
-_SMALL = 1e-12  # of the doubled A, when what is missing from the sum is of the order of its square
+_SMALL = 1e-12  # size of the doubled A at convergence: the missing terms are of the order of its square
 
 
 class Sum(NamedTuple):
-    """X (n, n, ...), and whether A turned out to be stable (...); if not, X means nothing."""
+    """Solution X (n, n, ...), and whether A is stable (...); if not, X is undefined."""
 
     X: Matrix
     stable: jax.Array
 
 
 def lyapunov(A: MatrixLike, Q: MatrixLike) -> jax.Array:
-    """X (n, n) of A' X + X A + Q = 0 for a stable A, all of whose eigenvalues have negative real parts.
+    """Returns X (n, n) of A' X + X A + Q = 0 for a stable A, all of whose eigenvalues have negative real parts.
 
     Differentiable to any order. Under jit, an unstable A gives NaN.
 
@@ -59,7 +59,7 @@ def lyapunov(A: MatrixLike, Q: MatrixLike) -> jax.Array:
 
 
 def stein(A: MatrixLike, Q: MatrixLike) -> jax.Array:
-    """X (n, n) of A' X A - X + Q = 0 for a stable A, all of whose eigenvalues are inside the unit circle.
+    """Returns X (n, n) of A' X A - X + Q = 0 for a stable A, all of whose eigenvalues are inside the unit circle.
 
     Differentiable to any order. Under jit, an unstable A gives NaN.
 
@@ -83,7 +83,7 @@ def _solved(A: MatrixLike, Q: MatrixLike, equation: Callable[..., jax.Array], al
 
 
 def lyapunov_equation(A: jax.Array, Q: jax.Array) -> jax.Array:
-    """`lyapunov` without its checks."""
+    """Solves the equation of `lyapunov` without its checks."""
     return lax.custom_linear_solve(
         lambda X: -(A.T @ X + X @ A),
         Q,
@@ -93,7 +93,7 @@ def lyapunov_equation(A: jax.Array, Q: jax.Array) -> jax.Array:
 
 
 def stein_equation(A: jax.Array, Q: jax.Array) -> jax.Array:
-    """`stein` without its checks."""
+    """Solves the equation of `stein` without its checks."""
     return lax.custom_linear_solve(
         lambda X: X - A.T @ X @ A,
         Q,
@@ -103,7 +103,7 @@ def stein_equation(A: jax.Array, Q: jax.Array) -> jax.Array:
 
 
 def sum_continuous(A: Matrix, Q: Matrix) -> Sum:
-    """Lyapunov's equation, matrix axes first: Cayley's transform makes it Stein's."""
+    """Solves Lyapunov's equation, matrix axes first, as Stein's equation after Cayley's transform."""
     shift = cayley_shift(A)
     resolvent = inverse(shift * identity_like(A) - A)
     discrete = 2.0 * shift * resolvent - identity_like(A)
@@ -111,7 +111,7 @@ def sum_continuous(A: Matrix, Q: Matrix) -> Sum:
 
 
 def sum_discrete(A: Matrix, Q: Matrix) -> Sum:
-    """Stein's equation, matrix axes first."""
+    """Solves Stein's equation, matrix axes first, by doubling."""
 
     def unfinished(carry: tuple[Matrix, Matrix, jax.Array]) -> jax.Array:
         _, power, count = carry
@@ -127,7 +127,7 @@ def sum_discrete(A: Matrix, Q: Matrix) -> Sum:
 
 
 def cayley_shift(A: Matrix) -> jax.Array:
-    """The geometric mean of |eigenvalues| (...), near which a shift makes doubling converge fastest."""
+    """Returns the geometric mean of |eigenvalues| (...), near which a shift makes doubling converge fastest."""
     return jnp.exp(log_abs_determinant(A) / A.shape[0])
 
 

@@ -1,15 +1,15 @@
-"""How far a loop u = -K s is from instability: gain, phase, delay and disk margins, and the poles it has.
+"""Stability margins of a loop u = -K s: gain, phase, delay and disk margins, and its poles.
 
-The loop is broken at the plant's single input, L(s) = K (sI - A)^-1 B. Everything is read from the complementary
-sensitivity T = L / (1 + L) = K (sI - A + B K)^-1 B on the imaginary axis, which a stable loop keeps finite even where
+The loop is broken at the plant's single input, L(s) = K (sI - A)^-1 B. All margins follow from the complementary
+sensitivity T = L / (1 + L) = K (sI - A + B K)^-1 B on the imaginary axis, which is finite for a stable loop even where
 the plant has poles there:
 
     |L| = 1       where  Re T = 1/2;  then T = 1/2 + y i and arg L = 2 atan(2 y)
     L real        where  Im T = 0;    a gain k puts a pole there if k = -1 / L = 1 - 1 / T
     |S - T| / 2   =      |T - 1/2|,   whose peak is 1 / (disk margin), S = 1 - T
 
-The frequencies at which this happens are zeros of functions made of T(s) and T(-s), found as eigenvalues of a matrix
-(no grid to slip through), polished by Newton's method, and differentiated by the implicit function theorem.
+The frequencies at which this happens are zeros of functions of T(s) and T(-s), found as eigenvalues of a matrix (no
+grid could miss one), polished by Newton's method, and differentiated by the implicit function theorem.
 """
 
 import math
@@ -26,52 +26,52 @@ from cpjax.linear.arguments import column, columns, gain_matrix, matrices, squar
 
 
 class Margins(NamedTuple):
-    """What a stable loop tolerates at the plant's input. All scalars; of an unstable loop all but `stable` are NaN.
+    """Margins of a stable loop at the plant's input, all scalars; for an unstable loop all but `stable` are NaN.
 
-    The frequency of a margin that nothing limits is NaN.
+    The frequency of an unlimited margin is NaN.
     """
 
     stable: jax.Array
     """Whether every closed-loop pole has a negative real part."""
     gain_lower: jax.Array
-    """Factor below 1 down to which the loop gain may fall; 0 if to nothing. Above 0 if the plant itself is unstable."""
+    """Factor below 1 down to which the loop gain may fall; 0 if unlimited, above 0 if the plant itself is unstable."""
     gain_lower_frequency: jax.Array
-    """The phase crossover where it would oscillate [rad/s]; 0 if a real pole would cross."""
+    """Phase crossover at which the loop would oscillate [rad/s]; 0 if a real pole would cross the axis."""
     gain_upper: jax.Array
-    """Factor above 1 up to which the loop gain may rise; inf if without bound."""
+    """Factor above 1 up to which the loop gain may rise; inf if unlimited."""
     gain_upper_frequency: jax.Array
-    """The phase crossover where it would oscillate [rad/s]; 0 if a real pole would cross."""
+    """Phase crossover at which the loop would oscillate [rad/s]; 0 if a real pole would cross the axis."""
     phase: jax.Array
-    """Phase lag or lead, whichever is less, that the loop just no longer tolerates [rad]; inf if |L| = 1 nowhere."""
+    """Phase lag or lead, whichever is less, that destabilises the loop [rad]; inf if |L| = 1 nowhere."""
     phase_frequency: jax.Array
-    """The gain crossover that limits it [rad/s]."""
+    """Gain crossover that limits `phase` [rad/s]."""
     delay: jax.Array
-    """Delay that the loop just no longer tolerates [s]; inf if |L| = 1 nowhere."""
+    """Delay that destabilises the loop [s]; inf if |L| = 1 nowhere."""
     delay_frequency: jax.Array
-    """The gain crossover that limits it [rad/s]; another than that of `phase` where a lead or a faster one decides."""
+    """Gain crossover that limits `delay` [rad/s]; not that of `phase` where a lead or a faster crossover decides."""
     disk: jax.Array
     """Disk margin alpha in (0, 2], of skew 0: 1 / max |S - 1/2| = 2 / max |S - T|."""
     disk_frequency: jax.Array
-    """Where that maximum is [rad/s]; inf where alpha is 2, which is what high frequencies approach."""
+    """Frequency of that maximum [rad/s]; inf where alpha is 2, the limit at high frequencies."""
     disk_gain: jax.Array
-    """g above 1: the disk holds every factor in (1/g, g); (2 + alpha) / (2 - alpha)."""
+    """g = (2 + alpha) / (2 - alpha), above 1: the disk contains every gain factor in (1/g, g)."""
     disk_phase: jax.Array
-    """The disk holds every lag and lead below it [rad]; 2 atan(alpha / 2), at most pi / 2."""
+    """2 atan(alpha / 2), at most pi / 2 [rad]: the disk contains every phase lag and lead below it."""
 
 
 def closed_loop_poles(A: Any, B: Any, K: Any) -> jax.Array:
-    """Poles of the loop u = -K s, the eigenvalues of A - B K.
+    """Computes the poles of the loop u = -K s, the eigenvalues of A - B K.
 
-    Where poles coincide they are not differentiable, and rounding parts a pole of multiplicity m by up to about
-    eps^(1/m) of the largest: derivatives there are infinite, NaN or meaningless. `characteristic_polynomial` is smooth.
+    Where poles coincide they are not differentiable, and rounding splits a pole of multiplicity m by up to about
+    eps^(1/m) of the largest: derivatives there are infinite, NaN or undefined. `characteristic_polynomial` is smooth.
 
     Args:
-      A: shape (n, n).
+      A: shape (n, n) [1/s].
       B: shape (n, m), or (n,) for one input.
       K: shape (m, n), or (n,) for one input.
 
     Returns:
-      Complex, shape (n,), sorted by real part, then imaginary part; of a conjugate pair the lower one comes first.
+      Complex, shape (n,) [1/s], sorted by real part, then imaginary part (of a conjugate pair the lower one first).
 
     Raises:
       InputError: not finite real matrices of these shapes.
@@ -84,16 +84,16 @@ def closed_loop_poles(A: Any, B: Any, K: Any) -> jax.Array:
 
 
 def characteristic_polynomial(A: Any) -> jax.Array:
-    """Coefficients of det(sI - A) by Faddeev's and LeVerrier's recursion, smooth also where eigenvalues coincide.
+    """Computes the coefficients of det(sI - A), smooth also where eigenvalues coincide.
 
-    The k-th coefficient carries an absolute error of about eps times the k-th power of the norm of A, so that small
-    ones are lost beside eigenvalues of very different size.
+    Uses the recursion of Faddeev and LeVerrier. The k-th coefficient has an absolute error of about eps times the k-th
+    power of the norm of A, so that small ones are lost if eigenvalues differ strongly in size.
 
     Args:
       A: shape (n, n).
 
     Returns:
-      Shape (n,): monic without its leading 1, highest power first.
+      Shape (n,), highest power first, without the leading 1.
 
     Raises:
       InputError: not a finite real square matrix.
@@ -103,7 +103,7 @@ def characteristic_polynomial(A: Any) -> jax.Array:
 
 
 def loop_polynomials(A: Any, B: Any, K: Any) -> tuple[jax.Array, jax.Array]:
-    """Numerator N and denominator D of L(s) = K (sI - A)^-1 B; the closed loop's polynomial is N + D.
+    """Computes numerator N and denominator D of L(s) = K (sI - A)^-1 B; the closed loop's polynomial is N + D.
 
     Args:
       A: shape (n, n).
@@ -111,7 +111,7 @@ def loop_polynomials(A: Any, B: Any, K: Any) -> tuple[jax.Array, jax.Array]:
       K: shape (1, n) or (n,).
 
     Returns:
-      N, shape (n,), from s^(n-1) down, and D, shape (n,), monic without its leading 1: their powers match.
+      N, shape (n,), from s^(n-1) down, and D, shape (n,), of the same powers, without its leading 1.
 
     Raises:
       InputError: not finite real matrices of these shapes.
@@ -122,22 +122,22 @@ def loop_polynomials(A: Any, B: Any, K: Any) -> tuple[jax.Array, jax.Array]:
 
 
 def margins(A: Any, B: Any, K: Any) -> Margins:
-    """Margins of the continuous-time loop u = -K s, broken at the plant's input.
+    """Computes the margins of the continuous-time loop u = -K s, broken at the plant's input.
 
     The two gain margins bound the interval around 1 of the factors on K that keep the loop stable. The phase margin is
     that of Seiler, Packard and Gahinet, "An introduction to disk margins" (2020): the lesser of lag and lead. The delay
-    margin is the least lag over frequency among all gain crossovers. The disk margin, there too, allows gain and phase
-    to change together: by a factor (2 + d) / (2 - d) with any complex |d| < alpha.
+    margin is the least lag over frequency among all gain crossovers. The disk margin, also defined there, allows gain
+    and phase to change together: by a factor (2 + d) / (2 - d) with any complex |d| < alpha.
 
     A gain factor below sqrt(eps) counts as 0 and one above 1 / sqrt(eps) as infinite. On the paper's loops float64 is
-    good to 1e-13 and float32 to 1e-4. The larger the gain, the more its terms cancel and the less is left: with entries
-    of K beyond 1e5 float32 can miss a crossover.
+    accurate to 1e-13 and float32 to 1e-4. The larger the gain, the more digits cancel: with entries of K beyond 1e5
+    float32 can miss a crossover.
 
-    Differentiable in A, B and K to any order as long as no other crossover takes over as the one that limits; where one
-    does, the derivative is one of the two sides'. What is 0, infinite or NaN has the derivative 0.
+    Differentiable in A, B and K to any order as long as the same crossover limits a margin; where another one takes
+    over, the derivative is that of one side. Values that are 0, infinite or NaN have the derivative 0.
 
     Args:
-      A: shape (n, n).
+      A: shape (n, n) [1/s].
       B: shape (n, 1) or (n,).
       K: shape (1, n) or (n,).
 
@@ -150,15 +150,15 @@ def margins(A: Any, B: Any, K: Any) -> Margins:
 @jax.jit
 def _margins(A: jax.Array, B: jax.Array, K: jax.Array) -> Margins:
     closed = A - jnp.outer(B, K)
-    poles = jnp.linalg.eigvals(lax.stop_gradient(closed))  # for the scale and yes or no only; NaN where two meet
+    poles = jnp.linalg.eigvals(lax.stop_gradient(closed))  # for scale and stability only; gradient NaN where two meet
     stable = jnp.all(poles.real < 0.0)
-    # A harmless stand-in keeps numbers and derivatives finite where the answer will be NaN.
+    # A stable replacement keeps numbers and derivatives finite where the result will be NaN.
     closed = jnp.where(stable, closed, -jnp.eye(A.shape[0], dtype=A.dtype))
     poles = jnp.where(stable, poles, -jnp.ones_like(poles))
     loop = _Loop(closed, B, K)
     scale = jnp.exp(jnp.mean(jnp.log(jnp.abs(poles))))
 
-    fixed = lax.stop_gradient(loop)  # candidates are guesses; `_tied` gives their roots the derivative
+    fixed = lax.stop_gradient(loop)  # only guesses; `_tied` differentiates their roots
     lower, upper = _gain_margins(_crossovers(_imaginary_part, _phase_candidates(fixed, scale), loop, scale), loop)
     crossovers = _crossovers(_above_half, _gain_candidates(fixed), loop, scale)
     phase, delay = _phase_and_delay_margins(crossovers, loop)
@@ -171,7 +171,7 @@ def _margins(A: jax.Array, B: jax.Array, K: jax.Array) -> Margins:
 
 
 class _Loop(NamedTuple):
-    """T(s) = K (sI - F)^-1 B, with F = A - B K."""
+    """Realisation of T(s) = K (sI - F)^-1 B, with F = A - B K."""
 
     F: jax.Array
     B: jax.Array
@@ -179,7 +179,7 @@ class _Loop(NamedTuple):
 
 
 class _Crossovers(NamedTuple):
-    """Frequencies, of which only those marked are crossovers."""
+    """Frequencies [rad/s]; only those marked `valid` are crossovers."""
 
     frequency: jax.Array
     valid: jax.Array
@@ -192,7 +192,7 @@ _Margin: TypeAlias = tuple[jax.Array, jax.Array]
 
 
 def _single_input(A: Any, B: Any, K: Any) -> list[jax.Array]:
-    """A (n, n), B (n,), K (n,)."""
+    """Returns A (n, n), B (n,) and K (n,) of a loop with one input."""
     A, B, K = matrices(A=A, B=B, K=K)
     n = square("A", A)
     B = column("B", B, n)
@@ -200,7 +200,7 @@ def _single_input(A: Any, B: Any, K: Any) -> list[jax.Array]:
 
 
 def _resolvent(A: jax.Array, n: int) -> tuple[jax.Array, list[jax.Array]]:
-    """Coefficients of det(sI - A), and the matrices of adj(sI - A), both from the highest power of s down."""
+    """Returns the coefficients of det(sI - A) and the matrices of adj(sI - A), from the highest power of s down."""
     identity = jnp.eye(n, dtype=A.dtype)
     adjugate, coefficients = [identity], []
     for k in range(1, n + 1):
@@ -211,7 +211,7 @@ def _resolvent(A: jax.Array, n: int) -> tuple[jax.Array, list[jax.Array]]:
 
 
 def _transfer(frequency: jax.Array, loop: _Loop) -> jax.Array:
-    """T at `frequency` times i."""
+    """Computes T at s = i `frequency`."""
     n = loop.F.shape[0]
     resolvent = lax.complex(-loop.F, frequency * jnp.eye(n, dtype=loop.F.dtype))
     states = jnp.linalg.solve(resolvent, lax.complex(loop.B, jnp.zeros_like(loop.B)))
@@ -227,7 +227,7 @@ def _imaginary_part(frequency: jax.Array, loop: _Loop) -> jax.Array:
 
 
 def _excess(frequency: jax.Array, loop: _Loop) -> jax.Array:
-    """|T - 1/2|^2 - 1/4, without the cancellation."""
+    """Computes |T - 1/2|^2 - 1/4 without cancellation."""
     T = _transfer(frequency, loop)
     return T.real * T.real + T.imag * T.imag - T.real
 
@@ -237,21 +237,24 @@ def _excess_slope(frequency: jax.Array, loop: _Loop) -> jax.Array:
 
 
 def _with_slope(function: _OfFrequency, frequency: jax.Array, loop: _Loop) -> tuple[jax.Array, jax.Array]:
-    """Value and derivative with respect to frequency."""
+    """Returns value and derivative with respect to frequency."""
     return jax.jvp(lambda w: function(w, loop), (frequency,), (jnp.ones_like(frequency),))
 
 
 def _gain_candidates(loop: _Loop) -> jax.Array:
-    """Axis zeros of T(s) + T(-s) - 1."""
+    """Returns candidates for zeros of T(s) + T(-s) - 1 on the imaginary axis."""
     feedback = jnp.outer(loop.B, loop.K)
     plant = loop.F + feedback
     return _on_axis(jnp.linalg.eigvals(jnp.block([[plant, -feedback], [feedback, -plant]])))
 
 
 def _phase_candidates(loop: _Loop, scale: jax.Array) -> jax.Array:
-    """Axis zeros of T(s) - T(-s), which vanishes at infinity: from the inverse of its system pencil at a shift."""
+    """Returns candidates for zeros of T(s) - T(-s) on the imaginary axis.
+
+    It vanishes at infinity, so they come from the inverse of its system pencil at a shift.
+    """
     n = loop.F.shape[0]
-    shift = 0.7390851332151607 * scale  # real, and by this factor hardly a zero itself
+    shift = 0.7390851332151607 * scale  # real; with this factor it is unlikely to be a zero itself
     B, K = loop.B * (scale / _largest(loop.B)), loop.K * (scale / _largest(loop.K))
     one, zero = shift * jnp.eye(n, dtype=scale.dtype), jnp.zeros_like(loop.F)
     pencil = jnp.block(
@@ -262,20 +265,20 @@ def _phase_candidates(loop: _Loop, scale: jax.Array) -> jax.Array:
         ]
     )
     inverse = jnp.linalg.solve(pencil, jnp.eye(2 * n + 1, 2 * n, dtype=scale.dtype))[: 2 * n]
-    return _on_axis(-1.0 / jnp.linalg.eigvals(inverse))  # the zeros less the shift
+    return _on_axis(-1.0 / jnp.linalg.eigvals(inverse))  # the zeros minus the shift
 
 
 def _level_candidates(loop: _Loop, level: jax.Array) -> jax.Array:
-    """Axis zeros of T(s) T(-s) - (T(s) + T(-s)) / 2 - level, where `_excess` is at the level."""
+    """Returns candidates for axis zeros of T(s) T(-s) - (T(s) + T(-s)) / 2 - level, where `_excess` is the level."""
     feedback = jnp.outer(loop.B, loop.K) / level
     half, lower = 0.5 * feedback, (level + 0.25) * feedback
     return _on_axis(jnp.linalg.eigvals(jnp.block([[loop.F - half, -feedback], [lower, half - loop.F]])))
 
 
 def _on_axis(zeros: jax.Array) -> jax.Array:
-    """Frequencies worth a look, given zeros (2n,) in conjugate pairs: shape (n,), ascending, filled up with 0.
+    """Returns candidate frequencies (n,), ascending and padded with 0, from zeros (2n,) in conjugate pairs.
 
-    No zero is refused for its real part: rounding decides about that, and a frequency too many does no harm.
+    No zero is rejected for its real part, which is subject to rounding: a superfluous candidate does no harm.
     """
     usable = jnp.isfinite(zeros.imag) & (zeros.imag > 0.0)
     return jnp.sort(jnp.where(usable, zeros.imag, 0.0))[zeros.shape[0] // 2 :]
@@ -291,16 +294,16 @@ def _epsilon(array: jax.Array) -> float:
 
 
 def _crossovers(condition: _OfFrequency, guesses: jax.Array, loop: _Loop, scale: jax.Array) -> _Crossovers:
-    """The roots of `condition` near each guess, with their derivatives in the loop."""
+    """Returns the root of `condition` near each guess, with its derivative with respect to the loop."""
     return jax.vmap(partial(_root, condition), in_axes=(0, None, None))(guesses, loop, scale)
 
 
 def _root(condition: _OfFrequency, guess: jax.Array, loop: _Loop, scale: jax.Array) -> _Crossovers:
-    """The positive root of `condition` near a guess, marked valid where Newton's steps have become short.
+    """Returns the positive root of `condition` near a guess, marked valid where Newton's steps have become short.
 
-    Where there is none they do not: at a distance d from the axis they stay longer than d.
+    Without a root on the axis they do not: for a zero at a distance d from the axis they stay longer than d.
     """
-    fixed = lax.stop_gradient(loop)  # the iteration is not differentiated; `_tied` does what the equation says
+    fixed = lax.stop_gradient(loop)  # the iteration is not differentiated; `_tied` differentiates the equation
 
     def newton(_: Any, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         frequency, _ = carry
@@ -317,7 +320,7 @@ def _root(condition: _OfFrequency, guess: jax.Array, loop: _Loop, scale: jax.Arr
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _tied(condition: _OfFrequency, frequency: jax.Array, loop: _Loop) -> jax.Array:
-    """`frequency`, a root of `condition`, as the function of the loop that it is."""
+    """Returns `frequency`, a root of `condition`, with its derivative with respect to the loop."""
     return frequency
 
 
@@ -333,7 +336,7 @@ def _tied_jvp(
 
 
 def _gain_margins(crossovers: _Crossovers, loop: _Loop) -> tuple[_Margin, _Margin]:
-    """Lower and upper, from all real values of T: that at frequency 0 is always one."""
+    """Returns the lower and the upper gain margin, from all real values of T; that at frequency 0 is always one."""
     frequency = jnp.pad(crossovers.frequency, (1, 0))
     valid = jnp.pad(crossovers.valid, (1, 0), constant_values=True)
     T = jax.vmap(_transfer, in_axes=(0, None))(frequency, loop).real
@@ -362,7 +365,7 @@ def _pick(index: jax.Array, valid: jax.Array, values: jax.Array, frequencies: ja
 
 
 class _Ascent(NamedTuple):
-    """How far the search for the peak has come."""
+    """State of the search for the peak."""
 
     level: jax.Array
     frequency: jax.Array
@@ -371,12 +374,13 @@ class _Ascent(NamedTuple):
 
 
 def _peak(loop: _Loop, scale: jax.Array, frequencies: jax.Array) -> _Margin:
-    """The maximum of `_excess` and its frequency; 0 and inf where it is not positive.
+    """Returns the maximum of `_excess` and its frequency; 0 and inf where it is not positive.
 
-    Level by level after Bruinsma and Steinbuch (1990): the axis candidates of a level bound the intervals that rise
-    above it, and the highest of these intervals' middles is the next level. No peak is too narrow for it.
+    Method: level by level after Bruinsma and Steinbuch (1990). The axis candidates of a level bound the intervals that
+    rise above it, and the highest value at the middles of these intervals is the next level. It finds a peak of any
+    width.
     """
-    fixed = lax.stop_gradient(loop)  # the search is not differentiated; at a maximum only the value's own part counts
+    fixed = lax.stop_gradient(loop)  # not differentiated: at a maximum the frequency's derivative does not count
     tolerance = math.sqrt(_epsilon(scale))
 
     def higher(ascent: _Ascent, frequencies: jax.Array) -> _Ascent:
@@ -392,12 +396,12 @@ def _peak(loop: _Loop, scale: jax.Array, frequencies: jax.Array) -> _Margin:
     def rise(ascent: _Ascent) -> _Ascent:
         edges = _level_candidates(fixed, ascent.level)
         below = jnp.pad(edges[:-1], (1, 0))
-        # Both means, because the edges may be decades apart, or one of them a 0 that rounding has moved.
+        # Both means, because the edges may be decades apart, or one of them a 0 displaced by rounding.
         return higher(ascent, jnp.concatenate([0.5 * (below + edges), jnp.sqrt(below * edges)]))
 
     rounds = jnp.zeros((), dtype=jnp.int32)
     flat = _Ascent(jnp.full_like(scale, tolerance), jnp.full_like(scale, jnp.inf), rounds == 0, rounds)
-    first = lax.stop_gradient(jnp.pad(frequencies, (1, 0)))  # where the search begins has no part in where it ends
+    first = lax.stop_gradient(jnp.pad(frequencies, (1, 0)))  # the result does not depend on the initial frequencies
     ascent = higher(flat, first)._replace(rising=rounds == 0)
     ascent = lax.while_loop(lambda ascent: ascent.rising & (ascent.rounds < 30), rise, ascent)
 

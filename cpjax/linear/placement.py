@@ -1,15 +1,15 @@
 """Pole placement for one input, and a parametrisation of stable polynomials that is smooth everywhere.
 
-The gain is Ackermann's (1972): K = e_n' C^-1 p(A), C the controllability matrix and p the wanted characteristic
-polynomial. Its formula is notorious for losing digits, and loses none here: it is evaluated in double-word arithmetic.
-It asks for a polynomial, not for poles, so that repeated ones are like any others.
+The gain is Ackermann's (1972): K = e_n' C^-1 p(A), with C the controllability matrix and p the desired characteristic
+polynomial. The formula is known for losing digits; here it is evaluated in double-word arithmetic and loses none. It
+takes a polynomial, not poles, so that repeated poles need no special treatment.
 
-A derivative follows from the polynomial's own. With A_K = A - B K and adj(s I - A_K) = sum of s^(n-1-k) H_k,
+The derivative follows from that of the polynomial. With A_K = A - B K and adj(s I - A_K) = sum of s^(n-1-k) H_k,
 
     dc_k = dK H_k B - tr(H_k (dA - dB K)),    k = 0 .. n-1
 
-is a linear equation for dK, smooth through repeated poles as well. Its solution is written as two tables of
-sensitivities, which are again sums in which digits cancel and are made in double-word arithmetic.
+is a linear equation for dK, smooth through repeated poles as well. Its solution is stored as two tables of
+sensitivities, which are again sums in which digits cancel and are computed in double-word arithmetic.
 """
 
 from collections.abc import Sequence
@@ -38,10 +38,10 @@ from cpjax.pytree import Array, is_traced
 
 
 def place(A: MatrixLike, B: MatrixLike, poles: Array | Sequence[complex]) -> jax.Array:
-    """The gain K (1, n) of u = -K s that gives A - B K these eigenvalues; see `place_polynomial`.
+    """Returns the gain K (1, n) of u = -K s that gives A - B K these eigenvalues; see `place_polynomial`.
 
     Args:
-      A: (n, n).
+      A: (n, n) [1/s].
       B: (n, 1) or (n,).
       poles: n of them, real or in complex conjugate pairs, in any order, repeated or not [1/s].
 
@@ -56,12 +56,12 @@ def place(A: MatrixLike, B: MatrixLike, poles: Array | Sequence[complex]) -> jax
 
 
 def place_polynomial(A: MatrixLike, B: MatrixLike, coefficients: Array | Sequence[float]) -> jax.Array:
-    """The gain K (1, n) of u = -K s that gives A - B K this characteristic polynomial.
+    """Returns the gain K (1, n) of u = -K s that gives A - B K this characteristic polynomial.
 
     Differentiable to any order in all arguments.
 
     Args:
-      A: (n, n).
+      A: (n, n) [1/s].
       B: (n, 1) or (n,).
       coefficients: (n,), of s^(n-1) down to s^0; that of s^n is 1.
 
@@ -79,7 +79,7 @@ def place_polynomial(A: MatrixLike, B: MatrixLike, coefficients: Array | Sequenc
 
 
 def polynomial_from_poles(poles: Array | Sequence[complex]) -> jax.Array:
-    """The coefficients (n,) of the monic polynomial with these roots, of s^(n-1) down to s^0; that of s^n is left out.
+    """Returns the coefficients (n,), from s^(n-1) down to s^0, of the monic polynomial with these roots.
 
     Raises:
       InputError: not a sequence of finite numbers, or concrete ones that are not closed under conjugation. Under jit
@@ -118,8 +118,8 @@ def polynomial_from_poles(poles: Array | Sequence[complex]) -> jax.Array:
 class QuadraticFactors(NamedTuple):
     """A stable real polynomial as a product of factors s^2 + a s + b with a, b > 0; and s + c, if its degree is odd.
 
-    Stable if and only if all numbers are positive. They move smoothly while two real poles meet and become a complex
-    pair, where the poles themselves have no derivative: use these, or their logarithms, as parameters of a design.
+    Stable if and only if all numbers are positive. They vary smoothly where two real poles meet and become a complex
+    pair and the poles themselves have no derivative: use them, or their logarithms, as parameters of a design.
     """
 
     a: jax.Array
@@ -131,10 +131,11 @@ class QuadraticFactors(NamedTuple):
 
     @classmethod
     def from_poles(cls, poles: Array | Sequence[complex]) -> "QuadraticFactors":
-        """The factors of concrete poles: conjugate pairs, then neighbours among the real ones, slowest first.
+        """Computes the factors of poles [1/s]: conjugate pairs, then neighbours among the real ones, slowest first.
 
         Raises:
-          InputError: poles that are not closed under conjugation, or not all in the open left half plane.
+          InputError: poles that JAX is tracing, that are not closed under conjugation, or that are not all in the open
+            left half plane.
         """
         if any(is_traced(p) for p in jax.tree.leaves(poles)):
             raise InputError("poles", poles, "known numbers, outside jit and vmap")
@@ -154,17 +155,17 @@ class QuadraticFactors(NamedTuple):
 
     @classmethod
     def from_unconstrained(cls, x: jax.Array) -> "QuadraticFactors":
-        """The factors of any real vector (n,), one to one."""
+        """Maps any real vector (n,) to factors, one to one: the numbers are the exponentials of its elements."""
         pairs = x.shape[0] // 2
         y = positive(x)
         return cls(y[:pairs], y[pairs : 2 * pairs], y[2 * pairs :])
 
     def unconstrained(self) -> jax.Array:
-        """The vector (n,) of which `from_unconstrained` makes these factors."""
+        """Returns the vector (n,) that `from_unconstrained` maps to these factors."""
         return from_positive(jnp.concatenate([self.a, self.b, self.c]))
 
     def polynomial(self) -> jax.Array:
-        """The coefficients (n,) that `place_polynomial` takes."""
+        """Returns the coefficients (n,) that `place_polynomial` takes."""
         whole = jnp.ones((1,), dtype=self.a.dtype)
         for i in range(self.a.shape[0]):
             whole = jnp.convolve(whole, jnp.stack([jnp.ones_like(self.a[i]), self.a[i], self.b[i]]))
@@ -173,24 +174,23 @@ class QuadraticFactors(NamedTuple):
         return whole[1:]
 
     def poles(self) -> jax.Array:
-        """The complex roots (n,), to read: they have no derivative where two of them meet [1/s]."""
+        """Returns the complex roots (n,) [1/s], for display: they have no derivative where two of them meet."""
         root = jnp.sqrt(lax.complex(self.a * self.a / 4 - self.b, jnp.zeros_like(self.a)))
-        first = -root - (0.5 * self.a).astype(
-            root.dtype
-        )  # the larger one: in the other, a slow pole's digits would cancel
+        # The larger root: in the formula for the other one, the digits of a slow pole would cancel.
+        first = -root - (0.5 * self.a).astype(root.dtype)
         second = jnp.where(root.imag > 0.0, first.conj(), self.b.astype(root.dtype) / first)
         return jnp.concatenate([second, first, -self.c.astype(root.dtype)])
 
 
 class _Placement(NamedTuple):
-    """The gain, and how it answers to the coefficients and to the closed loop's matrix."""
+    """Gain, and its sensitivities to the coefficients and to the closed loop's matrix."""
 
     K: Matrix
     """Shape (1, n)."""
     by_coefficient: Matrix
-    """dK_j / dc_k, shape (n, n): k, j."""
+    """dK_j / dc_k, shape (n, n), indexed [k, j]."""
     by_element: Matrix
-    """dK_j / d(A - B K)_ab with K held, shape (n, n, n): j, a, b."""
+    """dK_j / d(A - B K)_ab at constant K, shape (n, n, n), indexed [j, a, b]."""
 
 
 @batch_last
@@ -222,7 +222,7 @@ def _ackermann(A: Matrix, B: Matrix, coefficients: jax.Array) -> _Placement:
     )
     by_element = accurate_product(transpose(by_coefficient), flat).high.reshape((n, n, n, *A.shape[2:]))
 
-    # Where the data's own rounding is what makes the pair controllable, it also decides about the gain.
+    # No result where the pair is controllable only by rounding of the data: rounding would then determine the gain.
     gain = K.high[0]
     size = jnp.abs(A) + jnp.abs(B * gain[None])
     blur = np.finfo(A.dtype).eps * jnp.sum(jnp.abs(by_element) * size[None], axis=(1, 2))
@@ -236,7 +236,7 @@ def _side_by_side(columns: list[DoubleWord]) -> DoubleWord:
 
 
 def _sensitivities(A: jax.Array, B: jax.Array, K: jax.Array, coefficients: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The two tables of `_Placement` in plain floats, for their derivatives."""
+    """Computes the two tables of `_Placement` in plain floats, for their derivatives."""
     n = A.shape[0]
     closed, identity = A - B @ K, jnp.eye(n, dtype=A.dtype)
     adjugates = [identity]

@@ -1,22 +1,22 @@
-"""The algebraic Riccati equations of the linear quadratic regulator, in continuous and discrete time.
+"""Solvers of the algebraic Riccati equations of the linear quadratic regulator, in continuous and discrete time.
 
     A' P + P A - K' R K + Q = 0                    K = R^-1 (B' P + N')
     A' P A - P - K' (R + B' P B) K + Q = 0         K = (R + B' P B)^-1 (B' P A + N')
 
-and of their solutions the stabilising one, under which all eigenvalues of A - B K are stable. Of all u that bring s to
-rest, u = -K s minimises the integral, or the sum, of s' Q s + 2 s' N u + u' R u.
+The stabilising solution is computed, under which all eigenvalues of A - B K are stable. Of all u that bring s to rest,
+u = -K s minimises the integral, or the sum, of s' Q s + 2 s' N u + u' R u.
 
 It exists if and only if (A, B) is stabilisable and every mode of A on the boundary of stability (the imaginary axis, or
 the unit circle) is observable through Q; with N, of A - B R^-1 N' through Q - N R^-1 N'. The other modes need no
-weight: without one, those that are stable stay where they are, and those that are not are mirrored at the boundary.
+weight: without one, stable modes keep their eigenvalues, and unstable ones are mirrored at the boundary.
 
 Method: a structure-preserving doubling algorithm (Anderson, 1978; Chu, Fan and Lin, 2005) finds P to most of its
 digits. Newton's method (Kleinman, 1964; Hewer, 1971) corrects it, with the residual, P and K in double-word arithmetic,
-so that what is returned is the rounding of the exact solution, until the condition of the problem is beyond all floats.
-Each correction is a Lyapunov or Stein equation, and solving it proves the closed loop stable. Where this fails, it is
-done again, with doubling in double-word arithmetic and with a weight at the end of the horizon: P and the solution of
-the dual equation may be so large that doubling lost all digits, or Q may not see an unstable mode, in which case
-doubling without that weight finds a solution that does not stabilise.
+so that the result is the rounded exact solution, unless the problem is too ill-conditioned for the dtype. Each
+correction solves a Lyapunov or Stein equation, which also proves the closed loop stable. Where this fails, it is
+repeated with doubling in double-word arithmetic and with a weight at the end of the horizon: P and the solution of the
+dual equation may be so large that doubling lost all digits, or an unstable mode may be unobservable through Q, in which
+case doubling without that weight finds a solution that does not stabilise.
 
 Derivatives come from the same equations (Kao and Hennequin, 2020): with dA, dB, dQ, dN, dR and D = dA - dB K,
 
@@ -64,7 +64,7 @@ Problem: TypeAlias = tuple[Any, Any, Any, Any, Any]
 
 
 class RiccatiSolution(NamedTuple):
-    """P (n, n), K (m, n), and whether they were found; if not, both are NaN."""
+    """Solution P (n, n), gain K (m, n), and whether they were found; if not, both are NaN."""
 
     P: jax.Array
     K: jax.Array
@@ -102,7 +102,7 @@ def solve_care(
     Raises:
       InputError: shapes that do not fit, a concrete Q, R or N that is not as above, a concrete pair (A, B) that is not
         stabilisable, a mode of a concrete A on the imaginary axis that is not observable through Q, or a problem too
-        ill-conditioned for its dtype. Under jit the solution is NaN then, and its `found` is False.
+        ill-conditioned for its dtype. Under jit P and K are NaN instead, and `found` is False.
     """
     return _solved(_continuous, "continuous", A, B, Q, R, N)
 
@@ -112,7 +112,7 @@ def solve_dare(
 ) -> RiccatiSolution:
     """Solves the discrete-time Riccati equation for its stabilising solution, with its gain; as `solve_care`.
 
-    R is positive definite here too: that R + B' P B is, is not enough.
+    R must be positive definite here too: a positive definite R + B' P B is not enough.
     """
     return _solved(_discrete, "discrete", A, B, Q, R, N)
 
@@ -189,7 +189,7 @@ def _solve_discrete(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tu
 
 
 class _Doubled(NamedTuple):
-    """What doubling starts from: E, G, H of a discrete-time problem, and P's scale."""
+    """Initial values of doubling: E, G, H of a discrete-time problem, and the scale of P."""
 
     E: Matrix
     G: Matrix
@@ -198,14 +198,14 @@ class _Doubled(NamedTuple):
 
 
 class _Start(NamedTuple):
-    """What Newton's method starts from."""
+    """Initial value of Newton's method."""
 
     P: Matrix
     plausible: jax.Array
 
 
 class _Arithmetic(NamedTuple):
-    """The operations of a precision: on plain matrices, or on double-word ones."""
+    """Operations of one precision, on plain or on double-word matrices."""
 
     number: Callable[[Matrix], Any]
     rounded: Callable[[Any], Matrix]
@@ -224,7 +224,7 @@ def _found(
     gain: Callable[[DoubleWord], tuple[DoubleWord, DoubleWord]],
     valid: jax.Array,
 ) -> tuple[Matrix, Matrix]:
-    """Returns P and K, NaN where there are none. The second attempt is made only if a member of the batch needs it."""
+    """Returns P and K, NaN where there are none. The second attempt is made only if a batch element needs it."""
     P, K = _corrected(_double(problem, _PLAIN), correction, gain, valid)
     finite = jnp.all(jnp.isfinite(problem.E + problem.G + problem.H), axis=(0, 1))
     missed = valid & finite & ~jnp.all(jnp.isfinite(P), axis=(0, 1))
@@ -242,9 +242,9 @@ def _terminal_weight(problem: _Doubled) -> Matrix:
     """Returns S (n, n) of the cost s' S s at the end of the horizon: diagonal, above 0 where an input moves the state.
 
     Doubling takes the horizon to infinity. Without S it finds the least positive semidefinite solution, under which an
-    unstable mode that Q does not see stays unstable; with an S that weighs such modes, the stabilising one (Chan,
-    Goodwin and Sin, 1984). The size of S matters little. It is taken from a Gramian of the inputs, which gives it the
-    units of P whatever those of the states are; growing powers of E are scaled down.
+    unstable mode that is unobservable through Q stays unstable; with an S that weighs such modes, the stabilising one
+    (Chan, Goodwin and Sin, 1984). The size of S matters little. It is taken from a Gramian of the inputs, which gives
+    it the units of P for any units of the states; growing powers of E are scaled down.
     """
     E, G, _, _ = problem
     identity = identity_like(E)
@@ -259,20 +259,20 @@ def _terminal_weight(problem: _Doubled) -> Matrix:
 
 
 def _without_cross_term(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-    """A, G = B R^-1 B' and H = Q of the same equation with N = 0."""
+    """Returns A, G = B R^-1 B' and H = Q of the equivalent equation with N = 0."""
     weight = inverse(R)
     H = symmetric(Q - product(N, weight, transpose(N)))
     return A - product(B, weight, transpose(N)), symmetric(product(B, weight, transpose(B))), H
 
 
 def _balance(G: Matrix, H: Matrix) -> jax.Array:
-    """The factor that makes G and H equally large; P is scaled by its reciprocal."""
+    """Returns the factor that makes G and H equally large; P is scaled by its reciprocal."""
     scale = jnp.sqrt(largest(H) / largest(G))
     return jnp.where((scale > 0.0) & jnp.isfinite(scale), scale, 1.0)
 
 
 def _cayley(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> _Doubled:
-    """The discrete-time problem with the same solution, up to its scale (Chu, Fan and Lin, 2005)."""
+    """Returns the discrete-time problem with the same solution, up to its scale (Chu, Fan and Lin, 2005)."""
     A, G, H = _without_cross_term(A, B, Q, R, N)
     scale = _balance(G, H)
     G, H = G * scale, H / scale
@@ -287,8 +287,8 @@ def _cayley(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> _Doubled:
         size = jnp.maximum(largest(resolvent), largest(coupled))
         return resolvent, coupled, jnp.where(jnp.isfinite(size), size, jnp.inf)
 
-    # Near the geometric mean of the closed loop's eigenvalues; the factors keep it from being one of A's by design. By
-    # chance it may still be: of two, take the one that is farther away.
+    # The shift is near the geometric mean of the closed loop's eigenvalues; the factors prevent it from being an
+    # eigenvalue of A by construction. It may still be one by chance: of two shifts, the one farther away is taken.
     *one, near = inverses(1.0987 * shift)
     *other, far = inverses(1.4321 * shift)
     resolvent, coupled = (jnp.where(near <= far, x, y) for x, y in zip(one, other, strict=True))
@@ -336,10 +336,10 @@ def _double(problem: _Doubled, arithmetic: _Arithmetic, terminal: Matrix | None 
         G, H = even(add(G, more_G)), even(add(H, more_H))
         change = jnp.maximum(_relative_size(rounded(more_G), rounded(G)), _relative_size(rounded(more_H), solution(H)))
         if terminal is None:
-            # Convergence is quadratic: what comes after a change of sqrt(eps) is below eps.
+            # Convergence is quadratic: the change after one of sqrt(eps) is below eps.
             finished = ~(change > eps**0.5)
         else:
-            # Where the weight on a mode near the boundary of stability is the terminal one alone, P is halved first,
+            # If a mode near the boundary of stability has no weight but the terminal one, each step first halves P,
             # until it is as small as the distance from the boundary: only then is convergence quadratic.
             finished = finished | ((change <= eps) & (change <= 0.25 * previous)) | ~jnp.isfinite(change)
         return times(E, VE), G, H, change, finished, count + 1
@@ -353,9 +353,9 @@ def _double(problem: _Doubled, arithmetic: _Arithmetic, terminal: Matrix | None 
     unknown = jnp.full(problem.E.shape[2:], jnp.inf, dtype=problem.E.dtype)
     carry = (E0, G0, H0, unknown, finished, jnp.zeros((), dtype=jnp.int32))
     _, G, H, _, finished, _ = lax.while_loop(unfinished, double, carry)
-    # Without a terminal weight, and with a mode that is not stable and that Q does not see, G grows until overflow or
-    # rounding stops it: it is then no solution of the dual equation. (With a mode that cannot be moved, H is none of
-    # this one, and Newton's method finds none.)
+    # Without a terminal weight, and with a mode that is neither stable nor observable through Q, G grows until overflow
+    # or rounding stops it, and does not solve the dual equation. (With a mode that no input moves, H does not solve
+    # this equation, and Newton's method finds no solution.)
     again = rounded(add(G0, times(times(E0, divide(add(identity, times(G, H0)), G)), transpose(E0))))
     P = solution(H)
     G, H = rounded(G), rounded(H)
@@ -366,7 +366,7 @@ def _double(problem: _Doubled, arithmetic: _Arithmetic, terminal: Matrix | None 
 
 
 def _relative_size(change: Matrix, P: Matrix) -> jax.Array:
-    """The largest element of `change`, each relative to the geometric mean of P's diagonal elements on its lines."""
+    """Returns the largest element of `change`, relative to the geometric mean of P's diagonal at its row and column."""
     root = jnp.sqrt(jnp.abs(diagonal(P)))
     finfo = np.finfo(P.dtype)
     return jnp.max(jnp.abs(change) / (root[:, None] * root[None] + finfo.eps * largest(P) + finfo.tiny), axis=(0, 1))
@@ -378,15 +378,15 @@ def _corrected(
     gain: Callable[[DoubleWord], tuple[DoubleWord, DoubleWord]],
     valid: jax.Array,
 ) -> tuple[Matrix, Matrix]:
-    """Newton's method until P no longer changes; NaN where that, or anything before it, failed."""
+    """Applies Newton's method until P no longer changes; NaN where that, or anything before it, failed."""
     dtype, batch = start.P.dtype, start.P.shape[2:]
     eps = np.finfo(dtype).eps
     Carry: TypeAlias = tuple[DoubleWord, jax.Array, jax.Array, jax.Array, jax.Array]
 
     def unfinished(carry: Carry) -> jax.Array:
         _, size, previous, _, count = carry
-        # What the next correction would be is a small multiple of this one, or of its square; but only near the
-        # solution, so the first three may be of any size.
+        # The next correction is a small multiple of this one, or of its square, but only near the solution: the first
+        # three may be of any size.
         ahead = (size < 0.5 * previous) | (count < 3)
         return jnp.any((size > eps**0.75) & ahead) & (count < _MOST_CORRECTIONS)
 
@@ -405,7 +405,7 @@ def _corrected(
 
 
 def _weights_are_valid(Q: Matrix, R: Matrix, N: Matrix) -> jax.Array:
-    """Whether R is positive definite and [[Q, N], [N', R]] positive semidefinite, to rounding."""
+    """Returns whether R is positive definite and [[Q, N], [N', R]] positive semidefinite, to rounding."""
     H = symmetric(Q - product(N, inverse(R), transpose(N)))
     size = jnp.sqrt(jnp.abs(diagonal(Q)))
     size = jnp.where(size > 0.0, size, 1.0)
@@ -427,7 +427,7 @@ def _discrete(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, N: jax.Arr
 
 
 def _forcing(P: jax.Array, K: jax.Array, push: jax.Array, tangents: Problem) -> jax.Array:
-    """What the changes of the problem add to the equation: `push` is P (dA - dB K), times A_K in discrete time."""
+    """Returns the forcing term of the equation for dP; `push` is P (dA - dB K), in discrete time A_K' P (dA - dB K)."""
     _, _, dQ, dR, dN = tangents
     cross = dN @ K
     return push + push.T + dQ - cross - cross.T + K.T @ dR @ K
@@ -457,7 +457,7 @@ def _discrete_jvp(primals: Problem, tangents: Problem) -> tuple[Any, Any]:
     return (P, K), (dP, dK)
 
 
-# --- why there is no solution, for people -----------------------------------------------------------------------------
+# --- diagnosis of a missing solution, for error messages --------------------------------------------------------------
 
 _Numbers: TypeAlias = np.ndarray[Any, Any]
 
@@ -479,7 +479,7 @@ def _check_weights(time: str, Q: _Numbers, R: _Numbers, N: _Numbers, *, room: fl
 
 
 def _check_modes(time: str, A: _Numbers, B: _Numbers, Q: _Numbers, R: _Numbers, N: _Numbers, *, room: float) -> None:
-    """Refuses, up to `room`, a mode that is not stable and not moved, and one on the boundary that is not weighed."""
+    """Refuses, to the tolerance `room`, an uncontrollable unstable mode and an unobservable mode on the boundary."""
     mode = _fixed_mode(A, B, _unstable_modes(time, A, room), room)
     if mode is not None:
         allowed = (
@@ -496,16 +496,16 @@ def _check_modes(time: str, A: _Numbers, B: _Numbers, Q: _Numbers, R: _Numbers, 
 
 
 def _unstable_modes(time: str, A: _Numbers, room: float) -> _Numbers:
-    """The eigenvalues outside or on the boundary of stability, up to `room`."""
+    """Returns the eigenvalues outside or on the boundary of stability, to the tolerance `room`."""
     modes: _Numbers = np.linalg.eigvals(A)
     beyond = modes.real / max(float(np.linalg.norm(A)), 1e-300) if time == "continuous" else np.abs(modes) - 1.0
     return modes[beyond > -room]
 
 
 def _modes_moved_to_boundary(time: str, A: _Numbers) -> _Numbers:
-    """For every eigenvalue the nearest point of the boundary of stability.
+    """Returns for every eigenvalue (in discrete time, except 0) the nearest point of the boundary of stability.
 
-    Rounding parts repeated eigenvalues by far more than it changes the matrix. So the question is not which of them are
+    Rounding splits repeated eigenvalues by far more than it changes the matrix. So the test is not which of them are
     close to the boundary, but at which of these points the matrix is close to having one.
     """
     modes: _Numbers = np.linalg.eigvals(A).astype(np.complex128)
@@ -515,11 +515,11 @@ def _modes_moved_to_boundary(time: str, A: _Numbers) -> _Numbers:
 
 
 def _fixed_mode(A: _Numbers, B: _Numbers, modes: _Numbers, room: float) -> complex | None:
-    """Of the given numbers one that is an eigenvalue of A which no input moves (Popov, Belevitch and Hautus)."""
+    """Returns a given number that is an uncontrollable eigenvalue of A (Popov, Belevitch and Hautus), or None."""
     size, push = max(float(np.linalg.norm(A)), 1e-300), max(float(np.linalg.norm(B)), 1e-300)
     for mode in modes:
         pencil = np.hstack([(mode * np.eye(len(A)) - A) / size, B / push])
         if np.linalg.svd(pencil, compute_uv=False)[-1] < room:
-            # Adding 0 gives zero the sign that is not printed.
+            # Adding 0 turns -0 into 0, which is printed without a sign.
             return complex(mode.real + 0.0, mode.imag) if abs(mode.imag) > room * size else float(mode.real) + 0.0
     return None

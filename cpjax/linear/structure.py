@@ -1,4 +1,4 @@
-"""What the input can move and the outputs can see: controllability, observability, and their Gramians."""
+"""Controllability and observability of a linear model, and their Gramians."""
 
 import math
 from typing import Any, NamedTuple
@@ -14,13 +14,13 @@ from cpjax.linear.lyapunov import lyapunov
 from cpjax.pytree import Number, Scalar, is_traced
 
 POSITION_AND_ANGLE = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
-"""C of the paper's outputs: the two encoders, x [m] and theta [rad], in the state order of `State`; its D is zero."""
+"""Output matrix C of the paper's two encoders, x [m] and theta [rad], in the state order of `State`; D is zero."""
 
 _MOST_DOUBLINGS = 60
 
 
 class Structure(NamedTuple):
-    """A controllability or observability matrix and what its singular values say."""
+    """A controllability or observability matrix, and its rank and conditioning."""
 
     matrix: jax.Array
     """Shape (n, n m) or (n p, n)."""
@@ -33,12 +33,12 @@ class Structure(NamedTuple):
 
     @property
     def full(self) -> jax.Array:
-        """Whether the rank is n: every state can be moved, or seen."""
+        """Whether the rank is n, so that the pair is controllable or observable."""
         return self.rank == self.singular_values.shape[-1]
 
 
 def controllability_matrix(A: Any, B: Any) -> jax.Array:
-    """[B, A B, ..., A^(n-1) B].
+    """Computes [B, A B, ..., A^(n-1) B].
 
     Args:
       A: shape (n, n).
@@ -58,7 +58,7 @@ def controllability_matrix(A: Any, B: Any) -> jax.Array:
 
 
 def observability_matrix(A: Any, C: Any) -> jax.Array:
-    """[C; C A; ...; C A^(n-1)].
+    """Computes [C; C A; ...; C A^(n-1)].
 
     Args:
       A: shape (n, n).
@@ -75,10 +75,10 @@ def observability_matrix(A: Any, C: Any) -> jax.Array:
 
 
 def controllability(A: Any, B: Any) -> Structure:
-    """Rank and conditioning of the controllability matrix.
+    """Computes rank and conditioning of the controllability matrix.
 
-    The rank is a statement about rounded numbers: the matrix holds powers of A, so that beyond about eight states, or
-    with fast and slow modes together, a controllable pair may lack rank. A Gramian is then the better witness.
+    The rank is subject to rounding: the matrix holds powers of A, so that beyond about eight states, or with fast and
+    slow modes together, a controllable pair may lack rank. A Gramian is then the more reliable test.
 
     Args:
       A: shape (n, n).
@@ -91,7 +91,7 @@ def controllability(A: Any, B: Any) -> Structure:
 
 
 def observability(A: Any, C: Any) -> Structure:
-    """Rank and conditioning of the observability matrix; see `controllability`.
+    """Computes rank and conditioning of the observability matrix; see `controllability`.
 
     Args:
       A: shape (n, n).
@@ -104,25 +104,25 @@ def observability(A: Any, C: Any) -> Structure:
 
 
 def controllability_gramian(A: Any, B: Any, horizon: Scalar | None = None) -> jax.Array:
-    """W = integral from 0 to `horizon` of e^(A t) B B' e^(A' t) dt.
+    """Computes W, the integral from 0 to `horizon` of e^(A t) B B' e^(A' t) dt.
 
     x' W^-1 x is the least input energy that takes the state from rest at 0 to x within the horizon.
 
-    A finite horizon needs no stability. Van Loan's block exponential (1978) covers a piece of it that is short against
-    A's norm, and doubling the rest, W(2t) = W(t) + e^(A t) W(t) e^(A' t): a sum without cancellation. The relative
+    A finite horizon needs no stability. Van Loan's block exponential (1978) covers a piece of it of at most
+    1 / norm(A), and doubling the rest, W(2t) = W(t) + e^(A t) W(t) e^(A' t): a sum without cancellation. The relative
     error grows with the horizon as that of e^(A horizon) does, a few eps per unit of norm(A) * horizon; where
     e^(A horizon) overflows, so does W. (The block exponential alone loses digits with e^(norm(A) * horizon).)
 
     Args:
-      A: shape (n, n).
+      A: shape (n, n) [1/s].
       B: shape (n, m), or (n,) for one input.
-      horizon: [s], at least 0; None or inf for all time, which needs a stable A. A traced one is finite.
+      horizon: [s], at least 0; None or inf for all time, which requires a stable A. A traced one must be finite.
 
     Returns:
-      Symmetric, shape (n, n). Of an A that is not stable, the one for all time is NaN inside jit.
+      Symmetric, shape (n, n). For all time it is NaN inside jit if A is not stable.
 
     Raises:
-      InputError: not finite real matrices of these shapes; a negative horizon; one without end where a concrete A is
+      InputError: not finite real matrices of these shapes; a negative horizon; an infinite one where a concrete A is
         not stable.
     """
     A, B = _state_and_inputs(A, B)
@@ -130,21 +130,21 @@ def controllability_gramian(A: Any, B: Any, horizon: Scalar | None = None) -> ja
 
 
 def observability_gramian(A: Any, C: Any, horizon: Scalar | None = None) -> jax.Array:
-    """W = integral from 0 to `horizon` of e^(A' t) C' C e^(A t) dt.
+    """Computes W, the integral from 0 to `horizon` of e^(A' t) C' C e^(A t) dt.
 
-    x' W x is the output's energy over the horizon, left alone from the state x. For accuracy see
+    x' W x is the output's energy over the horizon, from the state x without input. For accuracy see
     `controllability_gramian`.
 
     Args:
-      A: shape (n, n).
+      A: shape (n, n) [1/s].
       C: shape (p, n), or (n,) for one output.
-      horizon: [s], at least 0; None or inf for all time, which needs a stable A. A traced one is finite.
+      horizon: [s], at least 0; None or inf for all time, which requires a stable A. A traced one must be finite.
 
     Returns:
-      Symmetric, shape (n, n). Of an A that is not stable, the one for all time is NaN inside jit.
+      Symmetric, shape (n, n). For all time it is NaN inside jit if A is not stable.
 
     Raises:
-      InputError: not finite real matrices of these shapes; a negative horizon; one without end where a concrete A is
+      InputError: not finite real matrices of these shapes; a negative horizon; an infinite one where a concrete A is
         not stable.
     """
     A, C = _state_and_outputs(A, C)
@@ -172,7 +172,7 @@ def _structure(matrix: jax.Array) -> Structure:
 
 
 def _gramian(A: jax.Array, Q: jax.Array, horizon: Scalar | None) -> jax.Array:
-    """Integral of e^(A t) Q e^(A' t)."""
+    """Computes the integral of e^(A t) Q e^(A' t) from 0 to the horizon."""
     horizon = math.inf if horizon is None else horizon
     rule = Number("s", "horizon", at_least=0.0, infinite=True)
     horizon = rule.normalise("horizon", horizon)
@@ -190,10 +190,10 @@ def _gramian(A: jax.Array, Q: jax.Array, horizon: Scalar | None) -> jax.Array:
 def _gramian_until(A: jax.Array, Q: jax.Array, horizon: jax.Array) -> jax.Array:
     n = A.shape[0]
     norm = jnp.max(jnp.sum(jnp.abs(A), axis=0))
-    # A number of doublings: a step function of A and the horizon, whose slope is 0 or nothing.
+    # The number of doublings is a step function of A and the horizon, whose derivative is 0 or undefined.
     doublings = lax.stop_gradient(jnp.clip(jnp.ceil(jnp.log2(norm * horizon)), 0.0, _MOST_DOUBLINGS))
     short = horizon * jnp.exp2(-doublings)
-    # W is linear in Q; in this unit neither Q nor A makes the block large. It cancels, so it needs no derivative.
+    # W is linear in Q; in this unit Q does not make the block large. The unit cancels, so it needs no derivative.
     unit = lax.stop_gradient(jnp.max(jnp.abs(Q)) * short)
     unit = jnp.where(unit > 0.0, unit, 1.0)
     block = jnp.block([[-A, Q / unit], [jnp.zeros_like(A), A.T]])
@@ -203,7 +203,7 @@ def _gramian_until(A: jax.Array, Q: jax.Array, horizon: jax.Array) -> jax.Array:
     def double(carry: tuple[jax.Array, jax.Array], i: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
         flow, W = carry
         active = i < doublings
-        # Idle steps compute with 0, so that nothing overflows in a branch that is not taken.
+        # Inactive steps compute with 0, so that nothing overflows in a branch that is not taken.
         e = jnp.where(active, flow, 0.0)
         return (jnp.where(active, e @ e, flow), W + e @ W @ e.T), None
 

@@ -25,7 +25,7 @@ def nondominated(points: Numbers) -> Numbers:
 
 
 def hypervolume(points: Numbers, reference: Numbers) -> float:
-    """Computes the area that points (n, 2) dominate up to `reference` (2,); larger is better (Zitzler, Thiele, 1998)."""
+    """Computes the area that points (n, 2) dominate up to `reference` (2,) (Zitzler and Thiele, 1998)."""
     points, reference = np.asarray(points, float), np.asarray(reference, float)
     front = points[nondominated(points)]
     front = front[np.all(front < reference, axis=1)]

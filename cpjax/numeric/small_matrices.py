@@ -88,7 +88,7 @@ def is_positive_definite(a: Matrix) -> jax.Array:
 
 
 def _eliminate(rows: Matrix) -> tuple[Matrix, jax.Array]:
-    """Reduces the first n columns of the rows (n, n + k, ...) to the identity; returns log |det| of those columns too."""
+    """Reduces the first n columns of the rows (n, n + k, ...) to the identity; also returns log |det| of them."""
     n = rows.shape[0]
     numbers = jnp.arange(n).reshape((n,) + (1,) * (rows.ndim - 1))
 

@@ -10,7 +10,7 @@ from cpjax.pytree import is_traced
 
 
 def positive(x: jax.Array) -> jax.Array:
-    """Returns exp(x), element by element: a step in x is a relative change of the positive number, whatever its unit."""
+    """Returns exp(x), element by element: a step in x is a relative change of the result, whatever its unit."""
     return jnp.exp(x)
 
 

@@ -1,4 +1,4 @@
-"""The tuned controllers that come with the package, for the appendix's plant at 12 V; see docs/results.md."""
+"""Tuned controllers that come with the package, for the plant of the paper's appendix at 12 V; see docs/results.md."""
 
 import importlib.resources
 from collections.abc import Mapping
@@ -14,14 +14,17 @@ from cpjax.plant import CartPole, Motor
 from cpjax.pytree import Number, rules
 
 PRESETS: Mapping[DesignName, str] = {"lqr": "tuned_lqr", "placement": "tuned_place"}
-"""The name of each design's; `cpjax.save` wrote the file of that name in this folder."""
+"""File name, without extension, of each design's preset in this folder; written by `cpjax.save`."""
 
 
 def preset(design: DesignName) -> Hybrid:
     """Loads the tuned hybrid controller whose regulator comes from "lqr" or "placement".
 
-    Both were made for `cpjax.paper.appendix_plant()`, with its supply of 12 V. On another plant they may fail:
-    `model_differences(controller, plant)` says whether it is another.
+    Both were tuned for `cpjax.paper.appendix_plant()`, with its supply of 12 V. On another plant they may fail:
+    `model_differences(controller, plant)` lists the differences.
+
+    Args:
+      design: design of the regulator's gain, "lqr" or "placement".
 
     Raises:
       InputError: another design.
@@ -34,10 +37,10 @@ def preset(design: DesignName) -> Hybrid:
 
 
 def model_differences(controller: Any, plant: CartPole) -> list[str]:
-    """Lists the parameters in which the plant that a controller was made for differs from `plant`, with both values.
+    """Lists the parameters, with both values, in which the plant of a controller's design differs from `plant`.
 
-    What a controller was made for is the model in its swing-up law. The list is empty where the two agree, and where
-    the controller has no model: a linear regulator alone does not know its plant.
+    The plant that a controller was designed for is the model in its swing-up law. The list is empty where the two
+    agree, and where the controller contains no model: a linear regulator alone does not.
     """
     models = [
         leaf
@@ -52,7 +55,7 @@ def model_differences(controller: Any, plant: CartPole) -> list[str]:
 
 
 def differences(one: CartPole, other: CartPole) -> dict[str, tuple[Any, Any]]:
-    """The parameters in which two plants differ by more than a rounding to float32, motor included: both values."""
+    """Returns both values of each number of CartPole and Motor that differs by more than a rounding to float32."""
     pairs = [(cls, a, b) for cls, a, b in ((CartPole, one, other), (Motor, one.motor, other.motor))]
     values = {
         name: (getattr(a, name), getattr(b, name))

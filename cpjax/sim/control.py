@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from cpjax.checks import call, integer, like, pair, real
+from cpjax.checks import arrays, call, integer, like, pair, real
 from cpjax.controllers.protocol import ModeMemory, as_sampled, modes_in, start_memory
 from cpjax.pytree import cast
 from cpjax.sim import plants
@@ -60,7 +60,7 @@ def start_control(plant: Plant, controller: Any, start: Tree, settings: Settings
         memory: Any = start_memory(controller, start)
     else:
         firmware = as_sampled(tracked(controller) if settings.derivative == "mean" else controller)
-        memory = cast(call("controller", firmware, "init", start), dtype_of(start))
+        memory = cast(arrays("controller.init: memory", call("controller", firmware, "init", start)), dtype_of(start))
         memory = jax.tree.map(jnp.asarray, memory)
     first = update_control(plant, controller, Control(memory, jnp.zeros((), dtype_of(start))), start, settings)
     if first.blend is None:
@@ -99,4 +99,5 @@ def _updated(controller: Any, memory: Any, state: Tree) -> tuple[Any, jax.Array]
     returned = call("controller", controller, "update", memory, state)
     updated, command = pair("controller.update", returned, "the new memory and the command")
     dtype = dtype_of(state)
+    updated = arrays("controller.update: memory", updated)
     return like("controller.update: memory", cast(updated, dtype), memory), real("controller.update", command, dtype)

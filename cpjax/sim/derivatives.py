@@ -33,7 +33,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from cpjax.checks import call, integer, real
+from cpjax.checks import arrays, call, integer, real
 from cpjax.controllers.hybrid import Hybrid
 from cpjax.controllers.protocol import (
     Controller,
@@ -209,7 +209,22 @@ def may_switch(controller: Any, start: Any) -> bool:
         return True
     if not isinstance(controller, Controller):
         return False
-    return bool(modes_in(jax.eval_shape(lambda: call("controller", controller, "init", start))))
+    return bool(
+        modes_in(
+            jax.eval_shape(lambda: arrays("controller.init: memory", call("controller", controller, "init", start)))
+        )
+    )
+
+
+def warn_of_memory() -> None:
+    """Warns that a metric of the voltage and a controller with a memory of numbers do not go together well."""
+    message = (
+        "derivative='mean': the metric depends on the voltage, and the controller keeps numbers in its memory, from "
+        "which later voltages follow. Those are replaced to first order only: the derivative of a metric that is not "
+        "linear in the voltage, such as the effort, is then approximate, and that of its total variation is wrong. "
+        "See docs/gradients.md"
+    )
+    warnings.warn(message, DerivativeWarning, stacklevel=2)
 
 
 def watched(tree: Any) -> Any:

@@ -47,3 +47,8 @@ def nonfinite_flag(tree: Any) -> jax.Array:
     """Returns NON_FINITE if a number of the tree is NaN, else 0; int32."""
     leaves = jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(tree) if is_number(leaf)])
     return jnp.where(jnp.any(leaves), int(Flag.NON_FINITE), 0).astype(jnp.int32)
+
+
+def nonfinite_input(voltage: jax.Array) -> jax.Array:
+    """Returns the flag of a run whose applied input is not finite, else 0."""
+    return jnp.where(jnp.isfinite(voltage), np.int32(0), np.int32(Flag.NON_FINITE))

@@ -1,6 +1,8 @@
 """Validation of the initial states of a rollout."""
 
 import functools
+import math
+import sys
 from typing import Any
 
 import jax
@@ -10,6 +12,8 @@ import numpy as np
 from cpjax.errors import InputError
 from cpjax.pytree import as_array, is_traced
 from cpjax.sim.plants import Plant
+
+_LARGEST = sys.float_info.max
 
 
 def checked_initial(plant: Plant, start: Any, field: str, *, batched: bool) -> tuple[Any, Any, int | None]:
@@ -54,14 +58,14 @@ def checked_tree(
         if isinstance(value, bool) or not (isinstance(value, (int, float)) or hasattr(value, "dtype")):
             raise InputError(path, value, "a real number or an array of them")
         if isinstance(value, (int, float)):
-            if not is_traced(limit) and not abs(value) <= limit:
+            if not is_traced(limit) and not (abs(value) <= limit and abs(value) <= _LARGEST):
                 raise InputError(path, value, _within(limit, units.get(name, "")))
         else:
             dtypes[name] = jnp.dtype(value.dtype) if is_traced(value) else jax.dtypes.canonicalize_dtype(value.dtype)
             if dtypes[name] not in (jnp.float32, jnp.float64):
                 raise InputError(path, f"array of dtype {value.dtype}", "of dtype float32 or float64")
             known = not is_traced(value) and not is_traced(limit)
-            if known and not np.all(np.abs(np.asarray(value)) <= np.asarray(limit)):
+            if known and not np.all((np.abs(np.asarray(value)) <= np.asarray(limit)) & np.isfinite(value)):
                 raise InputError(path, value, _within(limit, units.get(name, "")))
     name_of_type = type(start).__name__
     if len(set(dtypes.values())) > 1:
@@ -88,7 +92,8 @@ def checked_tree(
 
 
 def _within(limit: Any, unit: str) -> str:
-    return f"finite, and within {float(np.max(limit)):g} {unit}".rstrip()
+    largest = float(np.max(limit))
+    return "finite" if largest == math.inf else f"finite, and within {largest:g} {unit}".rstrip()
 
 
 @functools.cache

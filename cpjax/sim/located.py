@@ -14,15 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from cpjax.backend.single_kernel import outline, single_kernel
-from cpjax.checks import call
 from cpjax.errors import InputError
 from cpjax.sim import failures, plants
 from cpjax.sim.closed_loop import GATE_CROSSING, ContinuousLoop, HeldLoop, HeldMode, System
 from cpjax.sim.control import Control, start_control, update_control
-from cpjax.sim.flags import CHATTER_LENGTH, Flag, nonfinite_flag
+from cpjax.sim.flags import CHATTER_LENGTH, Flag, nonfinite_flag, nonfinite_input
 from cpjax.sim.integrators import INTEGRATORS, Integrator
 from cpjax.sim.metrics import Fold, Sample
-from cpjax.sim.per_step import sees_the_voltage, start_metric, update_metric
+from cpjax.sim.per_step import finish_metric, sees_the_voltage, start_metric, update_metric
 from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.saved import pack
 from cpjax.sim.scan import scan
@@ -75,6 +74,7 @@ def simulate(
     carry, kept = run(carry, plant, controller, fold, dt)
     loop, memory = carry
     last = _sample(plant, loop, loop.motion, dt)
+    last = last._replace(flag=last.flag | nonfinite_input(last.voltage))
     samples = None
     if kept is not None:
         samples, passed = kept
@@ -82,7 +82,7 @@ def simulate(
         wanted = jnp.arange(settings.save_every, settings.steps, settings.save_every, dtype=passed.dtype)
         rows = jnp.searchsorted(passed, wanted)
         samples = jnp.concatenate([pack(first)[None], samples[rows]])
-    return samples, last, call("metrics", fold, "finish", memory, last)
+    return samples, last, finish_metric(fold, memory, last)
 
 
 def _run(
@@ -181,7 +181,7 @@ def _control(
     control = update_control(plant, controller, loop.control, state, settings)
     changes = jnp.where(control.mode != loop.control.mode, loop.changes + 1, 0)
     mode = motion.mode._replace(u=control.applied)
-    seen, slopes = observe(system, motion.q, motion.v, mode)
+    seen, slopes, _ = observe(system, motion.q, motion.v, mode)
     new = (control, changes, motion._replace(mode=mode, seen=seen, slopes=slopes))
     control, changes, motion = jax.tree.map(
         lambda x, y: jnp.where(instant, x, y), new, (loop.control, loop.changes, motion)

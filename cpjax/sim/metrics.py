@@ -14,6 +14,7 @@ import numpy as np
 
 from cpjax.backend.extremes import fast_maximum, fast_minimum
 from cpjax.backend.trigonometry import sin_cos
+from cpjax.errors import InputError
 from cpjax.numeric.angles import wrap_angle
 from cpjax.pytree import Scalar, number, pytree
 from cpjax.sim.flags import STOPPED
@@ -59,6 +60,9 @@ class Sample(NamedTuple):
     @property
     def cart_acceleration(self) -> jax.Array:
         """x'' of a cart-pole from this sample on [m/s^2]."""
+        if "cart_acceleration" not in self.outputs:
+            names = ", ".join(self.outputs) or "none"
+            raise InputError("plant.outputs", names, "with cart_acceleration, for this metric")
         return self.outputs["cart_acceleration"]
 
 

@@ -15,12 +15,12 @@ from jax.extend.core import Literal
 
 from cpjax.backend import runtime
 from cpjax.backend.single_kernel import outline, single_kernel
-from cpjax.checks import call, like
+from cpjax.checks import arrays, call, like
 from cpjax.pytree import cast
 from cpjax.sim import failures, plants
 from cpjax.sim.control import Control, start_control, update_control
-from cpjax.sim.derivatives import shifted
-from cpjax.sim.flags import CHATTER_LENGTH, NEEDS_RECOMPUTE, Flag, nonfinite_flag
+from cpjax.sim.derivatives import shifted, warn_of_memory
+from cpjax.sim.flags import CHATTER_LENGTH, NEEDS_RECOMPUTE, Flag, nonfinite_flag, nonfinite_input
 from cpjax.sim.integrators import INTEGRATORS
 from cpjax.sim.metrics import Fold, Sample
 from cpjax.sim.plants import Plant, Tree
@@ -57,15 +57,21 @@ def simulate(
     loop = _Loop(start, control, flag, jnp.zeros_like(flag))
     _, first, _ = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
 
-    carry = (loop, start_metric(fold, first))
+    started = start_metric(fold, first)
+    if control.blend is not None and control.blend.memory_echo and sees_the_voltage(fold, started, first):
+        warn_of_memory()
+    carry = (loop, started)
     run = single_kernel(functools.partial(_run, settings=settings), stacks=True)
     (loop, memory), samples = run(carry, plant, controller, fold, dt)
     after, last, _ = _observe(plant, controller, loop, jnp.asarray(settings.steps), dt, settings)
+    broken = nonfinite_input(last.voltage)  # of the last instant, after which no step looks at it
+    broken = jnp.where(broken != 0, np.int32(NEEDS_RECOMPUTE), broken) if settings.fast_path else broken
+    last = last._replace(flag=last.flag | broken)
     clean = last._replace(flag=last.flag & ~NEEDS_RECOMPUTE)
     memory = _fold(
         fold, memory, clean, plant, loop.control, after.control, jnp.asarray(settings.steps), settings, update_metric
     )
-    return samples, _saved(plant, last, after), call("metrics", fold, "finish", memory, clean)
+    return samples, _saved(plant, last, after), finish_metric(fold, memory, clean)
 
 
 def _run(
@@ -156,13 +162,19 @@ def _saved(plant: Plant, sample: Sample, loop: _Loop) -> Sample:
 
 def update_metric(fold: Fold, memory: Any, sample: Sample) -> Any:
     """Returns a metric's state after a sample."""
-    updated = cast(call("metrics", fold, "update", memory, sample), sample.time.dtype)
+    updated = cast(arrays("metrics.update", call("metrics", fold, "update", memory, sample)), sample.time.dtype)
     return like("metrics.update", updated, memory)
 
 
 def start_metric(fold: Fold, first: Sample) -> Any:
     """Returns a metric's state before its first update, in the rollout's dtype."""
-    return jax.tree.map(jnp.asarray, cast(call("metrics", fold, "init", first), first.time.dtype))
+    begun = arrays("metrics.init", call("metrics", fold, "init", first))
+    return jax.tree.map(jnp.asarray, cast(begun, first.time.dtype))
+
+
+def finish_metric(fold: Fold, memory: Any, last: Sample) -> Any:
+    """Returns the result of a metric."""
+    return arrays("metrics.finish", call("metrics", fold, "finish", memory, last), keys=False)
 
 
 def _observe(

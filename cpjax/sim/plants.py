@@ -8,10 +8,11 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from cpjax.checks import call, like, pair, real
 from cpjax.errors import InputError
-from cpjax.pytree import Scalar
+from cpjax.pytree import Scalar, is_number, is_traced
 
 Tree: TypeAlias = Any
 """A pytree of scalars."""
@@ -104,6 +105,13 @@ def check_plant(plant: Any) -> None:
     missing = [name for name in needed if not hasattr(plant, name)]
     if missing or isinstance(plant, type):
         raise InputError("plant", plant, f"a cpjax.CartPole, or a plant of your own with {', '.join(needed)}")
+    leaves = jax.tree_util.tree_leaves_with_path(plant.limits)
+    for path, limit in leaves:
+        if not is_number(limit) or (not is_traced(limit) and np.any(np.isnan(limit))):
+            where = f"plant.limits{jax.tree_util.keystr(path)}"
+            raise InputError(where, limit, "a number: the largest magnitude of this component of the state")
+    if not leaves:
+        raise InputError("plant.limits", plant.limits, "a state: the largest magnitude of each component")
     for together in (("geometry", "geometry_near"), ("start_mode", "guards", "jump")):
         if 0 < sum(hasattr(plant, name) for name in together) < len(together):
             raise InputError("plant", plant, f"one with all of {', '.join(together)}, or none of them")
@@ -111,7 +119,11 @@ def check_plant(plant: Any) -> None:
 
 def coordinates(plant: Plant, state: Tree) -> tuple[Tree, Tree]:
     """Returns (q, v) of a state."""
-    return pair("plant.coordinates", call("plant", plant, "coordinates", state), "positions and velocities")
+    q, v = pair("plant.coordinates", call("plant", plant, "coordinates", state), "positions and velocities")
+    here, there = str(jax.tree.structure(q)), str(jax.tree.structure(v))
+    if here != there:
+        raise InputError("plant.coordinates", f"{here} and {there}", "positions and velocities of one structure")
+    return q, v
 
 
 def state_of(plant: Plant, q: Tree, v: Tree) -> Tree:
@@ -129,12 +141,18 @@ def state_of(plant: Plant, q: Tree, v: Tree) -> Tree:
 
 def geometry(plant: Plant, q: Tree) -> Tree:
     """Returns the functions of the positions that `accelerations` uses."""
-    return plant.geometry(q) if isinstance(plant, Geometric) else q
+    return call("plant", plant, "geometry", q) if isinstance(plant, Geometric) else q
 
 
 def geometry_near(plant: Plant, at: Tree, q: Tree, change: Tree) -> tuple[Tree, jax.Array]:
     """Returns the geometry at q, given the geometry `at` the positions q - `change`, and whether it is accurate."""
-    return plant.geometry_near(at, change) if isinstance(plant, Geometric) else (q, jnp.asarray(True))
+    if not isinstance(plant, Geometric):
+        return q, jnp.asarray(True)
+    returned = call("plant", plant, "geometry_near", at, change)
+    near, accurate = pair("plant.geometry_near", returned, "the geometry and whether it is accurate")
+    if jax.typeof(jnp.asarray(accurate)).dtype != jnp.bool_:
+        raise InputError("plant.geometry_near", accurate, "a pair, the geometry and a bool: whether it is accurate")
+    return like("plant.geometry_near", near, at), accurate
 
 
 def accelerations(plant: Plant, geometry: Tree, v: Tree, u: Scalar, mode: Tree = ()) -> Tree:

@@ -95,7 +95,7 @@ class Motion(NamedTuple):
 
 def start_motion(system: System, q: Tree, v: Tree, mode: Tree, dt: jax.Array) -> Motion:
     """Returns the motion at the first grid point, with steps of `dt` [s]."""
-    seen, slopes = observe(system, q, v, mode)
+    seen, slopes, _ = observe(system, q, v, mode)
     none = jnp.zeros_like(dt, dtype=jnp.int32)
     return Motion(q, v, mode, seen, slopes, none, 0.0 * dt, dt, 0.0 * dt, none + RUN, none, dt, none)
 
@@ -109,7 +109,7 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Arra
     q, v = integrator(
         lambda q, v: system.observe(q, v, motion.mode).acceleration, motion.q, motion.v, step, seen.acceleration
     )
-    ahead, slopes = observe(system, q, v, motion.mode)
+    ahead, slopes, drift = observe(system, q, v, motion.mode)
     landed, locating = stage == LANDED, stage >= 1
 
     # Newton's correction, unless it is too large to be valid: then the cubic approximated the guard badly.
@@ -155,6 +155,8 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Arra
         motion.guard,
     )
     q, v = _where(land, (new_q, new_v), (q, v))
+    # The last correction is zero to rounding, and carries the second derivative of the crossing's time.
+    ahead = ahead._replace(output=_shifted(ahead.output, drift, jnp.where(land, correction, 0.0)))
     moved = land | reached
     offset = jnp.where(land | short, motion.offset + corrected, jnp.where(at_grid, 0.0, motion.offset))
     step_next = jnp.where(fell, lax.stop_gradient(fraction * step), jnp.where(refine, corrected, dt - offset))
@@ -179,13 +181,28 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Arra
     )
 
 
-def observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, Guards]:
-    """Returns the system's observation, and the rates of change of its guards, which are not differentiable."""
+def observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, Guards, list[jax.Array]]:
+    """Returns the system's observation, and the rates of change of its guards and of the floating-point leaves of its
+    output, which are not differentiable."""
     seen = system.observe(q, v, mode)
     rates = lax.stop_gradient((v, seen.acceleration))
-    guards = lambda q, v: system.observe(q, v, mode).guards  # noqa: E731
-    _, slopes = jax.jvp(guards, lax.stop_gradient((q, v)), rates)
-    return seen, lax.stop_gradient(slopes)
+
+    def changing(q: Tree, v: Tree) -> tuple[Guards, list[jax.Array]]:
+        now = system.observe(q, v, mode)
+        return now.guards, [leaf for leaf in jax.tree.leaves(now.output) if _is_float(leaf)]
+
+    _, (slopes, drift) = jax.jvp(changing, lax.stop_gradient((q, v)), rates)
+    return seen, lax.stop_gradient(slopes), lax.stop_gradient(drift)
+
+
+def _is_float(leaf: Any) -> bool:
+    return jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
+
+
+def _shifted(output: Tree, drift: list[jax.Array], time: jax.Array) -> Tree:
+    """Returns an output at a slightly later time, to first order."""
+    left = iter(drift)
+    return jax.tree.map(lambda leaf: leaf + time * next(left) if _is_float(leaf) else leaf, output)
 
 
 def pick(values: Guards, number: jax.Array) -> jax.Array:

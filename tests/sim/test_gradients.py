@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,6 +57,12 @@ def test_arguments_that_mean_nothing_are_refused_by_name(arguments, field):
     with pytest.raises(InputError) as caught:
         gradients(outside, parameters(), STARTS, **arguments)
     assert caught.value.field == field
+
+
+def test_initial_states_that_are_not_finite_are_refused():
+    starts = dataclasses.replace(STARTS, theta=np.where(np.arange(STARTS.theta.size) == 1, np.inf, STARTS.theta))
+    with pytest.raises(InputError, match=r"starts\.theta = .*: must be finite"):
+        gradients(outside, parameters(), starts)
 
 
 @pytest.mark.parametrize("direction", ["forward", "reverse"])

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from extensions import dead_time
 
 import cpjax
 from cpjax import paper
@@ -394,3 +395,117 @@ class Bang:
 def test_a_mode_without_a_margin_warns_too():
     with pytest.warns(cpjax.DerivativeWarning):
         jax.grad(lambda edge: cpjax.measure(PLANT, Bang(edge), cpjax.HANGING, **RUN).effort)(0.1)
+
+
+# --- what is not a number ---------------------------------------------------------------------------------------------
+
+
+@pytree
+class LateNaN:
+    """Commands 1 V, and NaN at the last control instant."""
+
+    def init(self, measurement):
+        return jnp.asarray(0)
+
+    def update(self, count, measurement):
+        return count + 1, jnp.where(count == 10, jnp.nan, 1.0).astype(measurement.x.dtype)
+
+
+def test_a_command_that_is_nan_at_the_last_instant_is_flagged():
+    settings = {"duration": 0.05, "dt": 0.005}
+    start = cpjax.State(0.0, 0.0, 3.0, 0.0)
+    assert int(cpjax.rollout(PLANT, LateNaN(), start, **settings).flag) == cpjax.Flag.NON_FINITE
+    starts = jax.tree.map(lambda value: np.full(2, value), start)
+    assert cpjax.sweep(PLANT, LateNaN(), starts, **settings).flag.tolist() == [cpjax.Flag.NON_FINITE] * 2
+
+
+@pytree
+class BrokenGate:
+    """A gate whose margin is NaN beyond an angle."""
+
+    def margin(self, state, mode):
+        return jnp.where(state.theta > 2.9, jnp.nan, -1.0)
+
+
+@pytest.mark.parametrize("settings", [{}, {"switching": "located"}, {"derivative": "mean"}], ids=str)
+def test_a_gate_whose_margin_is_nan_is_flagged(settings):
+    controller = cpjax.Hybrid(CENTRED.swing_up, CENTRED.regulator, BrokenGate())
+    run = cpjax.rollout(PLANT, controller, cpjax.State(0.0, 0.0, 3.0, 0.0), **RUN, **settings)
+    assert int(run.flag) == cpjax.Flag.NON_FINITE
+    assert not bool(run.metrics.success)
+
+
+@pytree
+class TextMemory:
+    """A controller whose memory is a text."""
+
+    def init(self, measurement):
+        return {"phase": "idle"}
+
+    def update(self, memory, measurement):
+        return memory, 1.0
+
+
+@pytree
+class Results:
+    """A metric that returns things of its own."""
+
+    begin: object = 0.0
+    end: object = 0.0
+
+    def init(self, sample):
+        return self.begin
+
+    def update(self, memory, sample):
+        return memory
+
+    def finish(self, memory, last):
+        return jax.random.key(0) if self.end == "key" else self.end
+
+
+@pytree
+class Huge:
+    """A law that returns an integer which no array can hold."""
+
+    def voltage(self, state):
+        return 10**400
+
+
+@pytest.mark.parametrize("function", [cpjax.rollout, cpjax.sweep], ids=lambda f: f.__name__)
+def test_what_jax_takes_for_no_array_is_named(function):
+    start = cpjax.HANGING if function is cpjax.rollout else cpjax.sample_starts("hanging", 2, seed=1)
+    for controller, metrics, message in (
+        (TextMemory(), None, r"controller\.init: memory\['phase'\] = 'a str': must be a number or an array"),
+        (CENTRED, Results(begin="text"), r"metrics\.init = 'a str': must be a number or an array"),
+        (CENTRED, Results(end="text"), r"metrics\.finish = 'a str': must be a number or an array"),
+        (CENTRED, Results(end="key"), r"metrics\.finish = 'a random key': must be a number or an array"),
+        (Huge(), None, r"controller\.voltage = 'a int': must be a scalar"),
+    ):
+        with pytest.raises(cpjax.InputError, match=message):
+            function(PLANT, controller, start, metrics=metrics, **RUN)
+
+
+def test_what_a_plant_of_ones_own_returns_is_checked_and_named():
+    def plant(**changes):
+        return pytree(type("Changed", (cpjax.CartPole,), {"__doc__": "A plant.", **changes}))()
+
+    for changes, message in (
+        ({"coordinates": lambda self, s: (1.0, (1.0, 2.0))}, r"plant\.coordinates = .*: must be positions and veloc"),
+        ({"limits": property(lambda self: None)}, r"plant\.limits = None: must be a state"),
+        ({"limits": cpjax.State(math.nan, 1.0, 1.0, 1.0)}, r"plant\.limits\.x = nan: must be a number"),
+        ({"limits": cpjax.State("a", 1.0, 1.0, 1.0)}, r"plant\.limits\.x = 'a': must be a number"),
+        ({"outputs": lambda self, s, a, u: {}}, r"plant\.outputs = 'none': must be with cart_acceleration"),
+    ):
+        with pytest.raises(cpjax.InputError, match=message):
+            cpjax.rollout(plant(**changes), CENTRED, cpjax.HANGING, **RUN)
+    odd = plant(geometry_near=lambda self, geometry, change: geometry)
+    with pytest.raises(cpjax.InputError, match=r"plant\.geometry_near = .*: must be a pair"):
+        cpjax.sweep(odd, CENTRED, cpjax.sample_starts("hanging", 2, seed=1), **RUN)
+
+
+def test_the_derivative_of_the_mean_warns_of_voltage_metrics_with_a_memory():
+    controller = dead_time.example()[0]
+    settings = {**RUN, "derivative": "mean"}
+    with pytest.warns(cpjax.DerivativeWarning, match="total variation is wrong"):
+        cpjax.measure(PLANT, controller, cpjax.HANGING, **settings)
+    cpjax.measure(PLANT, controller, cpjax.HANGING, metrics=cpjax.TimeOutside(), **settings)
