@@ -5,7 +5,6 @@ for one initial state or a million. Importing it starts no JAX backend, loads no
 JAX's settings.
 """
 
-from cpjax import _moved as _moved
 from cpjax import startup as _startup  # noqa: F401  # must be first: the other imports take a second
 
 # isort: split
@@ -13,6 +12,7 @@ import importlib
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+from cpjax import _moved as _moved
 from cpjax.backend.runtime import configure_cpu
 from cpjax.controllers import (
     REGULATE,

@@ -14,7 +14,7 @@ import os, sys, jax, cpjax
 from cpjax.backend import runtime
 {before}
 done = runtime.configure_cpu({arguments})
-print(done, len(jax.devices()), runtime.fast_loops(), os.environ.get("XLA_FLAGS", ""))
+print(done, len(jax.devices()), runtime.compiler_fuses_loops(), os.environ.get("XLA_FLAGS", ""))
 """
 
 

@@ -124,7 +124,7 @@ def test_the_papers_loops_have_python_controls_margins(plant, design):
     assert math.isnan(found["gain_upper_frequency"])
 
 
-@rows("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 6))])
+@pytest.mark.parametrize("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 6))])
 def test_random_loops_have_python_controls_margins(n):
     for loop in random_loops(n, 40):
         found = numbers(margins(*loop))

@@ -71,7 +71,7 @@ def test_the_appendix_plant_has_the_gain_that_follows_from_the_printed_poles():
     assert relative_error(K, control.acker(A, B, POLES)) <= 1e-8
 
 
-@rows("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5, 6, 7, 8))])
+@pytest.mark.parametrize("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5, 6, 7, 8))])
 def test_the_closed_loop_has_the_wanted_polynomial_however_the_poles_lie(n):
     rng = np.random.default_rng(n)
     cases = [
@@ -314,7 +314,7 @@ def exact_gain(x, n):
     return K[0]
 
 
-@rows("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5, 6))])
+@pytest.mark.parametrize("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5, 6))])
 def test_derivatives_have_eight_digits_where_the_condition_is_below_a_million(n):
     rng = np.random.default_rng(n)
     x = np.stack([vector(rng.normal(size=(n, n)), rng.normal(size=(n, 1)), -np.arange(1.0, n + 1)) for _ in range(12)])

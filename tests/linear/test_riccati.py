@@ -22,7 +22,9 @@ BATCHED = {time: jax.jit(jax.vmap(solve)) for time, solve in SOLVERS.items()}
 LANES = 40
 both = pytest.mark.parametrize("time", SOLVERS)
 # What is done to the arguments is the same code for both.
-continuous_discrete_slow = rows("time", ["continuous", pytest.param("discrete", marks=pytest.mark.slow)])
+continuous_discrete_slow = pytest.mark.parametrize(
+    "time", ["continuous", pytest.param("discrete", marks=pytest.mark.slow)]
+)
 
 ONE = np.eye(1)
 
@@ -394,7 +396,7 @@ def steps(time, problem):
     return vector((np.full_like(A, scale), np.full_like(B, scale), weights[:n, :n], weights[n:, n:], weights[:n, n:]))
 
 
-@rows(
+@pytest.mark.parametrize(
     ("time", "n", "m"),
     [
         pytest.param("continuous", 4, 1, marks=pytest.mark.slow),

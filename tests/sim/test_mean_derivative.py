@@ -14,6 +14,7 @@ import cpjax
 from cpjax import paper
 
 PLANT = paper.appendix_plant()
+SLOW = pytest.mark.slow  # half a minute of compiling each
 CENTRED = paper.controller("corrected-centred", "placement", PLANT)
 
 
@@ -50,7 +51,7 @@ def test_all_of_these_cross_once():
 
 @pytest.mark.parametrize(
     ("wrapped", "steps"),
-    [(False, 1), (True, 1), (False, 2)],
+    [(False, 1), pytest.param(True, 1, marks=SLOW), pytest.param(False, 2, marks=SLOW)],
     ids=["hybrid", "held in another controller", "two steps per control period"],
 )
 def test_its_error_in_single_runs_falls_with_the_period(wrapped, steps):
@@ -112,7 +113,11 @@ def differences(i, wrap, metrics, count=40_000, move=4e-3):
 
 @pytest.mark.parametrize(
     ("delayed", "metrics"),
-    [(False, cpjax.TimeOutside()), (False, Effort()), (True, cpjax.TimeOutside())],
+    [
+        pytest.param(False, cpjax.TimeOutside(), marks=SLOW),
+        (False, Effort()),
+        pytest.param(True, cpjax.TimeOutside(), marks=SLOW),
+    ],
     ids=["time outside", "effort", "time outside with a dead time"],
 )
 def test_it_is_that_of_differences_of_the_mean_within_three_standard_errors(delayed, metrics):
@@ -126,6 +131,7 @@ def test_it_is_that_of_differences_of_the_mean_within_three_standard_errors(dela
     assert abs(plain[:, 2].mean() - expected) > 5.0 * error  # the gate angle
 
 
+@SLOW
 def test_with_an_observer_it_differs_from_the_pathwise_one_and_forward_is_reverse():
     made, _ = observer.example()
 
@@ -176,6 +182,7 @@ def test_a_quantiser_has_the_derivative_that_its_name_says():
         cpjax.quantize(0.1, 0.1, derivative="one")
 
 
+@SLOW
 def test_the_gradient_of_a_mean_is_the_mean_of_gradients_under_vmap_and_in_sweeps():
     starts = catching(6, 6)
     settings = {"duration": 0.8, "dt": 0.002, "derivative": "mean", "metrics": cpjax.TimeOutside()}
@@ -207,6 +214,7 @@ class Looking:
         return {"inner": inner, "spare": None, "margin": margin}, command
 
 
+@SLOW
 def test_a_controller_that_looks_into_the_one_it_holds_has_the_same_derivative():
     starts = catching(4, 7)
     plain = derivatives(starts, derivative="mean", dt=0.002)

@@ -163,9 +163,9 @@ from cpjax import paper
 from cpjax.backend import runtime
 if sys.argv[1] == "configured":
     assert cpjax.configure_cpu(devices=8)
-    assert runtime.fast_loops()
+    assert runtime.compiler_fuses_loops()
 else:
-    assert not runtime.fast_loops()
+    assert not runtime.compiler_fuses_loops()
     assert len(jax.devices()) == 1
 plant = paper.appendix_plant()
 controller = paper.controller("corrected-centred", "placement", plant)

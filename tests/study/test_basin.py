@@ -81,7 +81,7 @@ def test_a_cells_outcome_is_that_of_a_rollout_from_its_start():
         (lambda: StartGrid(ANGLE, ANGLE), "StartGrid.up"),
         (lambda: StartGrid(ANGLE, RATE, {"theta": (0.0, 0.0)}), "StartGrid.others"),
         (lambda: StartGrid(ANGLE, RATE, {"x": (1.0, 0.0)}), r"StartGrid.others\[x\]"),
-        (lambda: StartGrid(ANGLE, RATE, seed=-1), "Map.seed"),
+        (lambda: StartGrid(ANGLE, RATE, seed=-1), "StartGrid.seed"),
     ],
 )
 def test_bad_maps_are_refused(make, field):
