@@ -36,10 +36,14 @@ EXAMPLES = {
     "recorded voltage": (recorded, "voltages"),
 }
 """What makes each, and the field whose numbers its derivative is taken in."""
+MARKED = [
+    pytest.param(name, marks=[pytest.mark.slow] * (name in ("observer", "square wave")), id=name) for name in EXAMPLES
+]
+"""Two of them take minutes of compiling, and are like the others."""
 RUN = {"duration": 0.5, "dt": 0.002}
 
 
-@pytest.fixture(params=EXAMPLES)
+@pytest.fixture(params=MARKED)
 def example(request):
     return EXAMPLES[request.param][0]()
 
@@ -75,7 +79,7 @@ def test_a_controller_of_ones_own_runs_alone_under_jit_under_vmap_and_in_a_sweep
     assert_close(jax.tree.map(lambda x: x[1], saved.state), jax.tree.map(lambda x: x[::50], alone.state), 1e-8)
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize("name", MARKED)
 def test_its_derivative_is_that_of_differences_forward_in_reverse_and_under_vmap(name):
     make, field = EXAMPLES[name]
     controller, start = make()

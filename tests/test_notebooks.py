@@ -12,7 +12,11 @@ def code_cells(path):
     return [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=[pytest.mark.slow] * (path.stem[:2] not in ("01", "03"))) for path in NOTEBOOKS],
+    ids=lambda path: path.stem,
+)
 def test_its_code_runs(path, monkeypatch):
     monkeypatch.setenv("CPJAX_QUICK", "1")
     scope = {}

@@ -235,6 +235,7 @@ class TimeSwingingUp:
         return memory
 
 
+@SLOW
 def test_a_metric_of_the_mode_has_the_derivative_of_its_mean():
     found = derivatives(catching(4_000, 4), metrics=TimeSwingingUp(), derivative="mean", dt=0.002)
     expected, error = differences(2, lambda controller: controller, TimeSwingingUp())

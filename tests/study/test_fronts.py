@@ -67,6 +67,7 @@ def test_the_reference_is_the_same_for_both_designs_and_beyond_their_baselines()
         np.testing.assert_allclose(found.reference[lane], 1.1 * points.max(axis=0))
 
 
+@pytest.mark.slow
 def test_a_supply_at_which_nothing_settles_is_named():
     weak = dataclasses.replace(PLANT, motor=dataclasses.replace(PLANT.motor, voltage_limit=1.0))
     with pytest.raises(InputError, match="voltage_limit"):
