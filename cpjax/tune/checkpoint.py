@@ -1,8 +1,10 @@
 """State of a tuning and its checkpoint file, from which a tuning interrupted at any moment resumes."""
 
+import hashlib
 import io as buffers
 import json
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,7 +51,7 @@ def store(path: Path | None, identity: str, memory: TunerState) -> None:
     arrays = {f"optimiser_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
     arrays |= {name: getattr(memory, name) for name in ("vectors", "best", "scores")}
     counts = {name: getattr(memory, name) for name in ("step", "stale", "value_steps", "gradient_steps")}
-    note = json.dumps({"identity": identity, "history": memory.history, **counts})
+    note = json.dumps({"identity": identity, "history": memory.history, **counts, "digest": _digest(arrays)})
     buffer = buffers.BytesIO()
     arrays["note"] = np.frombuffer(note.encode(), dtype=np.uint8)
     np.savez(buffer, allow_pickle=False, **arrays)
@@ -70,16 +72,29 @@ def restore(path: Path | None, identity: str, optimiser: optax.GradientTransform
     if path is None or not path.exists():
         return None
     try:
-        with np.load(path) as content:
+        with path.open("rb") as file, np.load(file) as content:
             arrays = {name: content[name] for name in content.files}
         note = json.loads(arrays.pop("note").tobytes())
+        if note.pop("digest") != _digest(arrays):
+            raise ValueError("its content was changed")
+        its_own = note.pop("identity")
         blank = optimiser.init(jnp.asarray(arrays["vectors"]))
         leaves = [jnp.asarray(arrays[f"optimiser_{i}"]) for i in range(len(jax.tree.leaves(blank)))]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as problem:
+        state = jax.tree.unflatten(jax.tree.structure(blank), leaves)
+        found = TunerState(optimiser=state, **{name: arrays[name] for name in ("vectors", "best", "scores")}, **note)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as problem:
         raise InputError("checkpoint", str(path), f"a file written by a tuning, or none ({problem})") from problem
-    if note.pop("identity") != identity:
+    if its_own != identity:
         allowed = "one of the same tuning (plan, plant, controller, versions); remove it, or choose another folder"
         raise InputError("checkpoint", str(path), allowed)
-    state = jax.tree.unflatten(jax.tree.structure(blank), leaves)
-    parts = {name: arrays[name] for name in ("vectors", "best", "scores")}
-    return TunerState(optimiser=state, **parts, **note)
+    return found
+
+
+def _digest(arrays: Mapping[str, Any]) -> str:
+    """Returns a checksum of arrays with their names, shapes and dtypes."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.shape} {array.dtype.str} ".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()

@@ -51,6 +51,21 @@ def test_a_checkpoint_of_another_tuning_is_refused(tuner, tmp_path):
     other = dataclasses.replace(SMALL, seed=2)
     with pytest.raises(InputError, match="same tuning"):
         tune(PLANT, tuner.free, other, checkpoint=path)
+    whole = path.read_bytes()
+    with np.load(path) as content:
+        arrays = {name: content[name] for name in content.files}
+    for name, changed in (
+        ("vectors", arrays["vectors"] + 1e-9),
+        ("scores", arrays["scores"][:-1]),
+        ("note", np.frombuffer(b'{"identity": 1}', np.uint8)),
+        ("note", np.frombuffer(b"[]", np.uint8)),
+    ):
+        np.savez(path, **{**arrays, name: changed})
+        with pytest.raises(InputError, match="checkpoint"):
+            tune(PLANT, tuner.free, SMALL, checkpoint=path)
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="checkpoint"):
+        tune(PLANT, tuner.free, SMALL, checkpoint=path)
     path.write_bytes(b"not a checkpoint")
     with pytest.raises(InputError, match="checkpoint"):
         tune(PLANT, tuner.free, SMALL, checkpoint=path)
