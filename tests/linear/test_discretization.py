@@ -60,6 +60,7 @@ def error(ours, reference):
 @rows("dtype", [np.float64, np.float32])
 @rows("period", PERIODS)
 @rows("model", MODELS)
+@pytest.mark.slow
 def test_model_and_cost_are_exact_to_a_few_roundings_of_the_largest_entry(model, period, dtype):
     A, B, Q, R = (M.astype(dtype) for M in MODELS[model])
     period = dtype(period)

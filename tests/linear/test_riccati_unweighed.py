@@ -140,6 +140,7 @@ def test_whatever_is_not_weighed_the_gain_is_scipys_to_rounding(time, n, m, syst
 
 
 @both
+@pytest.mark.slow
 def test_float32_finds_the_gains_of_all_but_few_and_these_are_right_to_rounding(time):
     problems = [tuple(x.astype(np.float32) for x in partly_weighed(time, 4, 1, seed)) for seed in range(60)]
     P, K, found = (np.asarray(x) for x in BATCHED[time](*stacked(problems, np.float32)))
@@ -277,6 +278,7 @@ def differences(function, x, step):
 
 
 @both
+@pytest.mark.slow
 def test_where_q_is_zero_the_derivatives_agree_with_differences(time):
     value, x = family(time)
     first = differences(jax.jit(jax.vmap(value)), x, 1e-3)

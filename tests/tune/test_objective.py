@@ -38,6 +38,7 @@ def test_terms_are_the_integrals_they_say():
     assert float(excess) == pytest.approx(np.sum(0.5 * 0.005 * (rate[1:] + rate[:-1])), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_every_terms_gradient_is_its_difference():
     goal = Goal(effort=0.01, track=1.0, track_limit=0.5, jerkiness=0.01, energy=0.5, terminal=1.0)
 
