@@ -25,7 +25,7 @@ class FrontConfig:
       fine: extra weight of each second lost when a run stops early [1].
       price: initial multiplier, of a cost in units of its bound [s].
       price_rate: in each step the multiplier grows by a factor exp(price_rate (cost / bound - 1)) [1].
-      dearest: the multiplier is clipped to [price / dearest, price * dearest] [1].
+      dearest: the multiplier stays between price / dearest and price * dearest [1].
       candidates: random controllers with which the search begins.
       screening: initial states on which candidates are screened.
       steps: of the optimiser.
