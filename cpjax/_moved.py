@@ -7,6 +7,7 @@ import sys
 import types
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 MOVED = {
     "cpjax.compilation": "cpjax.backend.single_kernel",
@@ -43,6 +44,20 @@ def new_name(old: str) -> str | None:
     return None
 
 
+def moved_attribute(module: str, name: str, homes: Sequence[types.ModuleType]) -> Any:
+    """Returns a name that moved from a module to one of its new homes, and warns.
+
+    Raises:
+      AttributeError: no home has it.
+    """
+    for home in homes:
+        if not name.startswith("_") and hasattr(home, name):
+            message = f"{module}.{name} is now {home.__name__}.{name}; the old name goes with version 0.3"
+            warnings.warn(message, DeprecationWarning, stacklevel=3)
+            return getattr(home, name)
+    raise AttributeError(f"module {module!r} has no attribute {name!r}")
+
+
 class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def find_spec(
         self, name: str, path: Sequence[str] | None = None, target: types.ModuleType | None = None
@@ -56,6 +71,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         module = types.ModuleType(spec.name, f"Old name of {now}.")
         real = importlib.import_module(now)
         # A module of its own rather than the real one: the import system writes its name and spec into it.
+        # mypy takes the hook of a module for a method that must not be replaced; modules have it to be set (PEP 562).
         module.__getattr__ = lambda name: getattr(real, name)  # type: ignore[method-assign]
         return module
 

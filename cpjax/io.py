@@ -1,30 +1,21 @@
-"""Reading and atomic writing of plants, controllers and results as JSON or TOML files.
+"""Plants, controllers and results as JSON or TOML files.
 
 A file holds one component as a table of its fields, tagged with its `type`; the outermost table also has `schema`.
 Python floats stay numbers, float64 arrays are plain lists, other arrays are tables of `dtype` and `values`. JSON has no
 non-finite numbers; they are the strings "inf", "-inf" and "nan" there.
 """
 
-import contextlib
 import dataclasses
 import importlib
-import importlib.metadata
-import json
-import math
-import os
-import re
-import secrets
-import shutil
-import stat
-import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import numpy as np
 import tomli_w
 
+from cpjax import files, workspace
+from cpjax._moved import moved_attribute
 from cpjax.controllers import (
     AngleGate,
     AngleRateGate,
@@ -39,13 +30,12 @@ from cpjax.controllers import (
     StateFeedback,
 )
 from cpjax.errors import InputError
+from cpjax.files import dump_json, read_table, suffix_of, write_text
 from cpjax.plant import CartPole, Motor
 from cpjax.plant.state import State
 from cpjax.pytree import is_traced
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import Trajectory
-
-_NON_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
 SCHEMA = 1
 """Version of the file layout."""
@@ -117,7 +107,7 @@ def save(path: str | Path, thing: Any) -> None:
         be written.
     """
     path = _checked_path(path)
-    suffix = _suffix(path)
+    suffix = suffix_of(path)
     table = {"schema": SCHEMA, **encode(thing)}
     write_text(path, tomli_w.dumps(table) if suffix == ".toml" else dump_json(table))
 
@@ -188,147 +178,10 @@ def encode(thing: Any) -> dict[str, Any]:
     return {"type": name, **{key: _encode_value(f"{name}.{key}", value) for key, value in given.items()}}
 
 
-def read_table(path: Path) -> dict[str, Any]:
-    """Reads the outermost table of a JSON or TOML file.
-
-    Raises:
-      InputError: no such file, or not a table in the format of its extension.
-    """
-    suffix = _suffix(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as problem:  # ValueError: not UTF-8, or a null byte in the path
-        raise InputError("path", str(path), f"a readable text file ({problem})") from problem
-    try:
-        table = tomllib.loads(text) if suffix == ".toml" else _numbers(json.loads(text, object_pairs_hook=_once))
-    except (ValueError, RecursionError) as problem:
-        raise InputError("path", str(path), f"a valid {suffix[1:].upper()} file ({problem})") from problem
-    if not isinstance(table, dict):
-        raise InputError("path", str(path), "a file that holds one table")
-    return table
-
-
-def write_json(path: Path, data: Any) -> None:
-    """Writes plain values (dicts, lists, numbers, NumPy and JAX arrays) as JSON, atomically."""
-    write_text(path, dump_json(data))
-
-
-def dump_json(data: Any) -> str:
-    """Formats plain values as strict JSON, with non-finite numbers as strings."""
-    text = json.dumps(_plain(data), indent=1, allow_nan=False)
-    # Puts each list of numbers on one line. JSON strings hold no raw line breaks, so none of them changes.
-    return re.sub(r"\[[^][{}]*\]", lambda match: re.sub(r"\n\s*", " ", match[0]), text) + "\n"
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a UTF-8 file atomically."""
-    write_bytes(path, text.encode("utf-8"))
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file atomically: even after an interruption it has either its old content or all of the new.
-
-    Raises:
-      InputError: the folder cannot be created, or the file cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}")
-        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)  # the umask applies
-    except (OSError, ValueError) as problem:  # ValueError: a null byte in the path
-        raise InputError("path", str(path), f"a place that can be written ({problem})") from problem
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        if path.exists():
-            os.chmod(temporary, stat.S_IMODE(path.stat().st_mode))
-        os.replace(temporary, path)
-    except BaseException as problem:
-        temporary.unlink(missing_ok=True)
-        if isinstance(problem, OSError):
-            raise InputError("path", str(path), f"a place that can be written ({problem})") from problem
-        raise
-
-
-@contextlib.contextmanager
-def parts_of(folder: Path, request: Mapping[str, Any]) -> Iterator[Path]:
-    """Provides a folder for the partial results of a long computation, as a context manager.
-
-    The folder is removed when the computation completes, or stops before it has saved anything. If it stops later, the
-    partial results stay for the next call with the same request.
-
-    Args:
-      folder: the folder, which need not exist.
-      request: plain values that identify the computation, such as its options, seeds and versions.
-
-    Raises:
-      InputError: as for `claim`.
-    """
-    path = folder / "request.json"
-    claim(path, request)
-    try:
-        yield folder
-    except BaseException:
-        if [*folder.iterdir()] == [path]:
-            release(folder)
-        raise
-    release(folder)
-
-
-def claim(path: Path, request: Mapping[str, Any]) -> None:
-    """Reserves a folder for the partial results of a computation, or checks that it is reserved for the same one.
-
-    Args:
-      path: the file in this folder that records the request.
-      request: plain values that identify the computation.
-
-    Raises:
-      InputError: the folder holds partial results of another request, or cannot be written.
-    """
-    asked = dump_json(request)
-    try:
-        others = [one for one in path.parent.iterdir() if one != path] if path.parent.exists() else []
-        same = path.exists() and path.read_text(encoding="utf-8", errors="replace") == asked
-    except OSError as problem:
-        raise InputError("path", str(path), f"a place that can be written ({problem})") from problem
-    if others and not same:
-        allowed = "a place without the parts of other work (other options, starts or versions); delete them first"
-        raise InputError("path", str(path.parent), allowed)
-    if not same:
-        write_text(path, asked)
-
-
-def release(folder: Path) -> None:
-    """Removes a claimed folder, after renaming it, so that an interruption leaves no partial results under its name."""
-    away = folder.with_name(f".{folder.name}.{os.getpid()}-{secrets.token_hex(4)}")
-    folder.replace(away)
-    shutil.rmtree(away)
-
-
-def versions() -> dict[str, str]:
-    """Returns the versions of cpjax, JAX, NumPy and SciPy; "0+unknown" for a package that is not installed."""
-    return {name: _version(name) for name in ("cpjax", "jax", "jaxlib", "numpy", "scipy")}
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "0+unknown"
-
-
 def _checked_path(path: Any) -> Path:
     if not isinstance(path, (str, Path)):
         raise InputError("path", path, "a file name, as str or Path; it comes first")
     return Path(path)
-
-
-def _suffix(path: Path) -> str:
-    if path.suffix.lower() not in (".json", ".toml"):
-        raise InputError("path", str(path), "a file name that ends in .json or .toml")
-    return path.suffix.lower()
 
 
 def _encode_value(name: str, value: Any) -> Any:
@@ -426,30 +279,6 @@ def _array(values: Any, dtype: Any, path: str, shown: Any) -> np.ndarray[Any, An
         raise InputError(path, shown, allowed) from problem
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Returns a JSON object as a table and refuses duplicate keys, as TOML does."""
-    table = dict(pairs)
-    if len(table) < len(pairs):
-        raise ValueError("a key is given twice in one table: " + ", ".join(key for key, _ in pairs))
-    return table
-
-
-def _numbers(data: Any) -> Any:
-    """Restores the non-finite numbers that `_plain` converted to strings."""
-    if isinstance(data, dict):
-        return {key: _numbers(value) for key, value in data.items()}
-    if isinstance(data, list):
-        return [_numbers(value) for value in data]
-    return _NON_FINITE.get(data, data) if isinstance(data, str) else data
-
-
-def _plain(data: Any) -> Any:
-    if isinstance(data, dict):
-        return {str(key): _plain(value) for key, value in data.items()}
-    if isinstance(data, (list, tuple)):
-        return [_plain(value) for value in data]
-    if isinstance(data, (np.ndarray, np.generic, jax.Array)):
-        return _plain(np.asarray(data).tolist())
-    if isinstance(data, float) and not math.isfinite(data):
-        return str(data)
-    return data
+def __getattr__(name: str) -> Any:
+    """Returns a function that moved from here to `cpjax.files` or `cpjax.workspace`, until version 0.3."""
+    return moved_attribute(__name__, name, (files, workspace))

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from cpjax import io
+from cpjax import files, io
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
@@ -51,13 +51,13 @@ def tuned(
 ) -> tuple[Hybrid, dict[str, Any]]:
     """The controller of a tuning, and its document; read from `out` if the same tuning is there already."""
     path, record, checkpoint = out / f"{case}.json", out / f"{case}.tune.json", out / f"{case}.npz"
-    asked = json.loads(io.dump_json(request(plant, free, plan)))
-    made = io.read_table(record) if path.exists() and record.exists() else {}
+    asked = json.loads(files.dump_json(request(plant, free, plan)))
+    made = files.read_table(record) if path.exists() and record.exists() else {}
     if any(made.get(key) != value for key, value in asked.items()):
         tuning = tune(plant, free, plan, checkpoint=checkpoint)
-        io.write_json(record, document(tuning, plant, free, plan))
+        files.write_json(record, document(tuning, plant, free, plan))
         io.save(path, tuning.controller)
         checkpoint.unlink()
     controller = io.load(path)
     assert isinstance(controller, Hybrid)
-    return controller, io.read_table(record)
+    return controller, files.read_table(record)

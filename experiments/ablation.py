@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from speed_against import Child, answer, cases
 
-from cpjax import io
+from cpjax import files
 from cpjax.cli.tables import print_table
 
 CASES = {
@@ -115,7 +115,7 @@ def main(out: Path, quick: bool = False, laps: int = 12) -> dict[str, Any]:
                     print(f"{part}, {name}: {row['gain']:.2f}", file=sys.stderr)
                 without.process.kill()
             whole.process.kill()
-        io.write_json(out / "ablation.json", {"versions": io.versions(), "rows": rows})
+        files.write_json(out / "ablation.json", {"versions": files.versions(), "rows": rows})
     for configured, names in CASES.items():
         gains = {(row["part"], row["case"]): row["gain"] for row in rows if row["configured"] == configured}
         texts = [

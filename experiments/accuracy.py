@@ -23,7 +23,7 @@ from _common import run
 from matplotlib.figure import Figure
 
 import cpjax
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.show.figures import save_figure
 
 STEPS = (0.016, 0.008, 0.004, 0.002, 0.001)
@@ -64,10 +64,10 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
         results[name] = {"errors": errors, "order": order}
         print(f"{name:11} order {order:5.2f}   " + "  ".join(f"{e:.1e}" for e in errors), flush=True)
 
-    io.write_json(
+    files.write_json(
         out / "accuracy.json",
         {
-            "versions": io.versions(),
+            "versions": files.versions(),
             "seed": seed,
             "starts": int(np.size(starts.x)),
             "steps": step_sizes,

@@ -21,7 +21,7 @@ from typing import Any
 from _common import run
 from matplotlib.figure import Figure
 
-from cpjax import io
+from cpjax import files
 from cpjax.cli.tables import print_table
 from cpjax.show.figures import save_figure
 
@@ -119,7 +119,7 @@ def _write(out: Path, rows: list[dict[str, Any]]) -> None:
         if "problem" not in row:
             same = c.get((row["dtype"], row["starts"], row["steps"], row["cores"]), fastest[row["dtype"]])
             row["of_C"] = None if same is None else row["steps_per_second"] / same
-    io.write_json(out / "benchmark.json", {"versions": io.versions(), "rows": rows})
+    files.write_json(out / "benchmark.json", {"versions": files.versions(), "rows": rows})
 
 
 def _table(rows: list[dict[str, Any]]) -> None:

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 import cpjax
-from cpjax import io, paper
+from cpjax import files, paper
 
 Arrays = tuple[np.ndarray[Any, Any], ...]
 
@@ -118,8 +118,8 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
     ours = rows[0]["us_per_design"]
     for row in rows:
         row["ratio"] = row["us_per_design"] / ours
-    result = {"versions": io.versions(), "device": str(jax.devices()[0]), "seed": seed, "rows": rows}
-    io.write_json(out / "benchmark_design.json", result)
+    result = {"versions": files.versions(), "device": str(jax.devices()[0]), "seed": seed, "rows": rows}
+    files.write_json(out / "benchmark_design.json", result)
     _print(rows)
     return result
 

@@ -21,7 +21,7 @@ from _common import run
 from _random_loops import GROUPS, draw
 
 import cpjax
-from cpjax import io
+from cpjax import files
 from cpjax.cli.progress import Report, progress
 from cpjax.show.figures import save_figure
 from cpjax.show.gradients import methods, picture
@@ -54,10 +54,10 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
     results = {name: {"stopped_share_of_draws": stopped[name], **_summary(audit)} for name, audit in audits.items()}
     total = _total(audits)
     _print(results, total)
-    io.write_json(
+    files.write_json(
         out / "gradient_accuracy.json",
         {
-            "versions": io.versions(),
+            "versions": files.versions(),
             "seed": seed,
             "count": count,
             **setting,

@@ -3,7 +3,8 @@
     python experiments/gradient_cost.py
 
 64 starts (and 4,096 in chunks of 64), 10 s at steps of 2 ms, float64, the smooth time outside the target of the
-corrected, centred law with pole placement; derivatives in eight parameters. Everything is compiled first; then all ways
+corrected, centred law with pole placement; derivatives in eight parameters. On the sampled clock, the derivative of the
+mean beside the pathwise one. Everything is compiled first; then all ways
 run in turn, several times, so that a busy machine slows all of them. Memory is what the compiler sets aside for
 temporaries.
 """
@@ -19,13 +20,15 @@ import numpy as np
 from _common import run
 
 import cpjax
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.cli.tables import print_table
 
 DURATION, DT = 10.0, 2e-3
 
 
-def objective(switching: Any, checkpoint: Any, duration: float) -> Callable[[Mapping[str, jax.Array], Any], jax.Array]:
+def objective(
+    switching: Any, checkpoint: Any, duration: float, derivative: Any = "pathwise"
+) -> Callable[[Mapping[str, jax.Array], Any], jax.Array]:
     """The time outside the target as a function of eight parameters and a start."""
     plant = paper.appendix_plant()
 
@@ -34,11 +37,14 @@ def objective(switching: Any, checkpoint: Any, duration: float) -> Callable[[Map
         law = cpjax.Hybrid(
             cpjax.EnergySwingUp(plant, **numbers), cpjax.StateFeedback(p["K"][None]), cpjax.AngleGate(p["half_angle"])
         )
-        settings: dict[str, Any] = {"switching": switching, "checkpoint": checkpoint}
+        settings: dict[str, Any] = {"checkpoint": checkpoint, "clock": "continuous", "switching": switching}
         if switching == "per_step":
-            settings["derivative"] = "pathwise"  # its cost is what is asked for here
+            settings["derivative"] = derivative  # its cost is what is asked for here
+        if switching == "sampled":
+            settings |= {"clock": "sampled", "switching": None, "derivative": derivative}
+        settings = {name: value for name, value in settings.items() if value is not None}
         found: jax.Array = cpjax.measure(
-            plant, law, start, clock="continuous", duration=duration, dt=DT, metrics=cpjax.TimeOutside(), **settings
+            plant, law, start, duration=duration, dt=DT, metrics=cpjax.TimeOutside(), **settings
         )
         return found
 
@@ -69,6 +75,14 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
         ways[64, switching, "reverse, segments"] = _compiled(_gradients(segments, "reverse"), parameters, few)
         ways[many, switching, "values"] = _compiled(_chunked(plain), parameters, lots)
         ways[many, switching, "reverse, every step"] = _compiled(_gradients(plain, "reverse"), parameters, lots)
+
+    if not quick:
+        ways[64, "sampled", "values"] = _compiled(
+            jax.vmap(objective("sampled", "segments", duration), (None, 0)), parameters, few
+        )
+        for kind in ("pathwise", "mean"):
+            sampled = objective("sampled", "segments", duration, kind)
+            ways[64, "sampled", f"reverse, {kind}"] = _compiled(_gradients(sampled, "reverse"), parameters, few)
 
     times: dict[Any, list[float]] = {key: [] for key in ways}
     for _ in range(repeats):
@@ -122,7 +136,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
         for r in rows
     ]
     print_table("Cost of located switching and of gradients", header, cells, text_columns=3)
-    io.write_json(out / "gradient_cost.json", {"versions": io.versions(), "seed": seed, "rows": rows})
+    files.write_json(out / "gradient_cost.json", {"versions": files.versions(), "seed": seed, "rows": rows})
     return rows
 
 

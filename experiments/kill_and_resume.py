@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from _common import run
 
-from cpjax import io
+from cpjax import files
 
 BUDGET = ("--design", "placement", "--candidates", "32", "--restarts", "4")
 SMALL = ("--batch", "8", "--steps", "40", "--duration", "2")
@@ -45,9 +45,9 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
             flush=True,
         )
     same = all(kill["identical"] for kill in kills)
-    result = {"versions": io.versions(), "length": length, "kills": kills, "identical": same}
+    result = {"versions": files.versions(), "length": length, "kills": kills, "identical": same}
     print(f"{sum(kill['killed'] for kill in kills)} kills; all ended {'identical' if same else 'NOT IDENTICAL'}")
-    io.write_json(out / "kill_and_resume.json", result)
+    files.write_json(out / "kill_and_resume.json", result)
     return result
 
 

@@ -13,13 +13,10 @@ Every derivative is of the time outside the target over 3 s, relative to a whole
    its standard error, beside the mean of derivative="mean" and of derivative="pathwise".
 3. Flux: the same over a tenth as many of the sets `hanging` and `anywhere`, where a moved parameter also moves initial
    states from one course to another: the share of the mean's change that no pathwise derivative sees.
-4. Cost: reverse mode in the parameters that are no part of the regulator, with derivative="mean" and
-   "pathwise", timed in turn.
 """
 
 import functools
-import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +26,7 @@ import numpy as np
 from _common import run
 
 import cpjax
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.cli.tables import print_table
 from cpjax.sim.metrics import Sample
 from cpjax.study.named_parameters import as_matrix, as_tree, parametrise
@@ -39,8 +36,8 @@ PERIODS = (4e-3, 2e-3, 1e-3, 5e-4)
 CENTRE = (0.03, 0.0, np.pi - 0.5, -0.5)
 """About which all initial states change their mode equally often."""
 WIDTH = 0.05
-UNDESIGNED = ("energy_gain", "cart_stiffness", "cart_damping", "half_angle", "rate")
-"""Parameters that are no part of the regulator, whose design would take its own time."""
+NAMES = ("energy_gain", "cart_stiffness", "cart_damping", "half_angle", "rate", "Q", "polynomial", "K")
+"""Parameters that derivatives are taken in, of those that a controller has."""
 MOVE = 1e-3
 """By which share of itself a parameter is moved for differences."""
 
@@ -66,11 +63,12 @@ class Loop:
     """A controller as a function of its named numbers, each in units of a whole change."""
 
     def __init__(
-        self, controller: cpjax.Hybrid, names: Collection[str] = (*UNDESIGNED, "Q", "polynomial", "K")
+        self,
+        controller: cpjax.Hybrid,
     ) -> None:
         self.plant = paper.appendix_plant()
         chosen = parametrise(self.plant, controller)
-        mine = {name: value for name, value in chosen.parameters.items() if name in names}
+        mine = {name: value for name, value in chosen.parameters.items() if name in NAMES}
         rest = {name: jnp.asarray(value) for name, value in chosen.parameters.items() if name not in mine}
         self.names, values, shapes = as_matrix(mine, 1, each=False)
         self.values, self.shapes = jnp.asarray(values[0]), shapes
@@ -100,19 +98,6 @@ class Loop:
             self.plant, self.controller(jnp.asarray(moves)), starts, metrics=Counted(), **settings
         )
         return np.asarray(value), np.asarray(changes)
-
-
-def cost_row(name: str, controller: cpjax.Hybrid, count: int, laps: int, seed: int) -> dict[str, Any]:
-    """Times both derivatives in turn and returns the median ratio."""
-    loop, starts = Loop(controller, UNDESIGNED), cpjax.sample_starts("hanging", count, seed=seed)
-    seconds: dict[str, list[float]] = {"mean": [], "pathwise": []}
-    for lap in range(laps + 1):
-        for kind in seconds:
-            before = time.perf_counter()
-            loop.gradient(starts, derivative=kind, dt=DT)
-            if lap:  # The first one compiles.
-                seconds[kind].append(time.perf_counter() - before)
-    return {"controller": name, "ratio": float(np.median(np.divide(seconds["mean"], seconds["pathwise"])))}
 
 
 def about_the_centre(count: int, seed: int) -> cpjax.State:
@@ -192,17 +177,15 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
         "paper, corrected": paper.controller("corrected-centred", "placement", plant),
     }
     few, many, gradients = (8, 64, 4) if quick else (256, 1_000_000, 30_000)
-    found: dict[str, list[dict[str, Any]]] = {"cost": [], "order": [], "mean": [], "flux": []}
+    found: dict[str, list[dict[str, Any]]] = {"order": [], "mean": [], "flux": []}
     for name, controller in controllers.items():
         loop = Loop(controller)
-        found["cost"].append(cost_row(name, controller, few, 2 if quick else 15, seed))
-        print(f"{name}: the derivative of the mean takes {found['cost'][-1]['ratio']:.2f} times plain reverse mode")
         found["order"] += order_rows(name, loop, few, seed)
         found["mean"] += mean_rows(name, loop, "box", about_the_centre(many, seed), gradients, MOVE)
         for of in ("hanging", "anywhere"):
             starts = cpjax.sample_starts(of, many // 10, seed=seed)
             found["flux"] += mean_rows(name, loop, of, starts, gradients, MOVE)
-        io.write_json(out / "mean_derivative.json", {"versions": io.versions(), "seed": seed, **found})
+        files.write_json(out / "mean_derivative.json", {"versions": files.versions(), "seed": seed, **found})
         show(name, found)
     return found
 

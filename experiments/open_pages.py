@@ -19,7 +19,7 @@ import numpy as np
 from _common import run
 from PIL import Image, ImageChops
 
-from cpjax import cli, io
+from cpjax import cli, files
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 WIDTHS = {"phone": 390, "desktop": 1280}
@@ -104,7 +104,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
         sheets = printed(browser, page, out / f"{page.stem}.pdf")
         print(f"{page.name}, printed: {sheets} sheets")
         found[page.name] = {"views": views, "sheets": sheets}
-    io.write_json(out / "open_pages.json", found)
+    files.write_json(out / "open_pages.json", found)
     if ill:
         raise SystemExit("not as they should be: " + ", ".join(ill))
     return found

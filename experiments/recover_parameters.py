@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from _common import run
 
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.paper.gain_identification import GainAudit, audit_gains, document
 from cpjax.paper.plant_fit import PARAMETERS
 from cpjax.paper.printed_gains import PrintedGain
@@ -56,13 +56,13 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
         f"{round(starts * min((fit.reached for fit in audit.simplest), default=0.0))} end in it.\n"
     )
     result = {
-        "versions": io.versions(),
+        "versions": files.versions(),
         "seed": seed,
         "paper": {**document(audit, papers_prints(), plant, starts=starts, parameters=names), "numbers": numbers},
         "rigs": recovered_rigs(IDENTIFIABLE[: 2 if quick else 3], count, starts=8 if quick else 32, seed=seed),
         "ratio": recovered_ratio(starts=8 if quick else 32, seed=seed),
     }
-    io.write_json(out / "recover_parameters.json", result)
+    files.write_json(out / "recover_parameters.json", result)
     save_figure(out / "recover_parameters.png", picture(audit))
     return result
 

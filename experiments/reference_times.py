@@ -15,7 +15,7 @@ from typing import Any, get_args
 import numpy as np
 from _common import run
 
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.plant import CartPole
 from cpjax.plant.initial_states import sample_starts
 from cpjax.plant.state import NAMES, State
@@ -41,7 +41,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
         import casadi
     except ImportError:
         print("the package casadi is missing: no reference")
-        io.write_json(out / "reference_times.json", {"versions": io.versions(), "settling_times": times})
+        files.write_json(out / "reference_times.json", {"versions": files.versions(), "settling_times": times})
         return {}
     best = np.full(count, math.inf)
     for i in range(count):
@@ -54,9 +54,9 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
                 f"{i + 1} of {count}: reference {np.min(best[: i + 1]):.3f} to {np.max(best[: i + 1]):.3f} s",
                 flush=True,
             )
-            io.write_json(out / "reference_times.json", {"reference": best[: i + 1]})
+            files.write_json(out / "reference_times.json", {"reference": best[: i + 1]})
     solved = np.isfinite(best)
-    result: dict[str, Any] = {"versions": io.versions(), "reference": best, "solved": int(solved.sum()), "laws": {}}
+    result: dict[str, Any] = {"versions": files.versions(), "reference": best, "solved": int(solved.sum()), "laws": {}}
     for design, time in times.items():
         ratio = (time / best)[solved]
         result["laws"][design] = {
@@ -66,7 +66,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
         }
         print(f"{design}: {ratio.mean():.3f} times the reference on average, {ratio.max():.3f} at worst")
     print(f"reference: {best[solved].mean():.3f} s on average, {int(solved.sum())} of {count} solved")
-    io.write_json(out / "reference_times.json", result)
+    files.write_json(out / "reference_times.json", result)
     return result
 
 

@@ -24,7 +24,7 @@ from _riccati_systems import Equation, Matrix, System
 from matplotlib.figure import Figure
 
 import cpjax
-from cpjax import io
+from cpjax import files
 from cpjax.cli.progress import progress
 from cpjax.linear.riccati import solve_care, solve_dare
 from cpjax.show.figures import save_figure
@@ -56,7 +56,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     """Prints the table and writes riccati_accuracy.json and riccati_accuracy.png."""
     path = out / "riccati_accuracy.json"
     setting = {"random_systems": 10 if quick else 1000, "quick": quick, "seed": seed, "code": _code()}
-    document: dict[str, Any] = {"versions": io.versions(), "setting": setting, "finished": False}
+    document: dict[str, Any] = {"versions": files.versions(), "setting": setting, "finished": False}
     measured = _unfinished(path, document)
     todo = [(equation, system) for equation in EQUATIONS for system in _chosen(equation, quick, seed)]
     with progress("Riccati equations") as report:
@@ -64,10 +64,10 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
             equation, system = todo[done]
             if done % SAVE_EVERY == 0:
                 report(done, len(todo), f"{equation} {system.name}")
-                io.write_json(path, {**document, "systems": measured})
+                files.write_json(path, {**document, "systems": measured})
             measured.append(measure(equation, system, cpjax_solution))
     rows = summaries(measured)
-    io.write_json(path, {**document, "finished": True, "rows": rows, "systems": measured})
+    files.write_json(path, {**document, "finished": True, "rows": rows, "systems": measured})
     save_figure(out / "riccati_accuracy.png", _figure(measured))
     _print(rows)
     return rows
@@ -123,7 +123,7 @@ def _unfinished(path: Path, document: dict[str, Any]) -> list[dict[str, Any]]:
     """What an interrupted run with the same setting, code and versions has left."""
     if not path.exists():
         return []
-    saved = io.read_table(path)
+    saved = files.read_table(path)
     same = all(saved.get(key) == value for key, value in document.items())
     return saved["systems"] if same else []
 

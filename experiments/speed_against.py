@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from cpjax import io
+from cpjax import files
 from cpjax.cli.tables import print_table
 
 Cases = dict[str, tuple[Callable[[], Any], float, int]]
@@ -157,7 +157,7 @@ def main(out: Path, quick: bool = False, against: str = "HEAD", laps: int = 20, 
                 child.process.kill()
         finally:
             subprocess.run(["git", "worktree", "remove", "--force", str(old)], cwd=here, check=True)
-    io.write_json(out / "speed_against.json", {"versions": io.versions(), "against": against, "rows": rows})
+    files.write_json(out / "speed_against.json", {"versions": files.versions(), "against": against, "rows": rows})
     texts = [
         (
             row["case"],

@@ -18,7 +18,7 @@ from typing import Any
 
 from _common import run
 
-from cpjax import io
+from cpjax import files
 
 IMPORT = "import time; t = time.perf_counter(); import {}; print(time.perf_counter() - t)"
 SWEEP = """
@@ -75,13 +75,13 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
     measured = json.loads(python(SWEEP.format(count=count, seed=seed, duration=duration)))
     sweep = {"starts": count, "duration_s": duration, **measured}
     result: dict[str, Any] = {
-        "versions": io.versions(),
+        "versions": files.versions(),
         "import_jax_s": statistics.median(imports["jax, jax.numpy"]),
         "import_cpjax_s": statistics.median(imports["cpjax"]),
         "first_swingup_s": {kept: statistics.median(found) for kept, found in first.items()},
         "sweep": sweep,
     }
-    io.write_json(out / "start_up.json", result)
+    files.write_json(out / "start_up.json", result)
     print(f"import jax     {result['import_jax_s']:.2f} s")
     print(f"import cpjax   {result['import_cpjax_s']:.2f} s, jax included")
     for kept, seconds in result["first_swingup_s"].items():

@@ -12,7 +12,7 @@ from typing import Any
 
 from _common import run
 
-from cpjax import io
+from cpjax import files
 from cpjax.numeric.statistics import two_proportion_p_value
 from cpjax.paper import Design
 from cpjax.paper.reproduction import EvaluationConfig, Variant, evaluate
@@ -52,8 +52,8 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
             f"   reference {100 * reference:5.1f} %   p = {p:.3f}   {'confirmed' if p >= 1e-3 else 'REFUTED'}",
             flush=True,
         )
-        document = {"versions": io.versions(), "setting": dataclasses.asdict(setting), "rows": rows}
-        io.write_json(out / "success_table.json", document)
+        document = {"versions": files.versions(), "setting": dataclasses.asdict(setting), "rows": rows}
+        files.write_json(out / "success_table.json", document)
     save_figure(out / "success_table.png", success_rates(rows))
     return rows
 

@@ -20,7 +20,7 @@ import numpy as np
 from _common import run
 
 import cpjax
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.cli.tables import print_table
 
 DURATION, DT = 3.0, 5e-3
@@ -129,7 +129,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     """Prints the table and writes sweep_against_measure.json."""
     count = 500 if quick else 1_000_000
     found = [compared(count, seed, dtype) for dtype in (np.float32, np.float64)]
-    io.write_json(out / "sweep_against_measure.json", {"versions": io.versions(), "seed": seed, "found": found})
+    files.write_json(out / "sweep_against_measure.json", {"versions": files.versions(), "seed": seed, "found": found})
     rows = [
         (
             row["dtype"],

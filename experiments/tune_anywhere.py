@@ -12,7 +12,7 @@ from typing import Any, get_args
 from _common import run
 from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned
 
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.plant.initial_states import sample_starts
 from cpjax.presets import preset
 from cpjax.sim.sweep import sweep
@@ -47,7 +47,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
                 f"located {100 * located:.2f} %",
                 flush=True,
             )
-            io.write_json(out / "tune_anywhere.json", {"versions": io.versions(), "seed": seed, "rows": rows})
+            files.write_json(out / "tune_anywhere.json", {"versions": files.versions(), "seed": seed, "rows": rows})
     return rows
 
 

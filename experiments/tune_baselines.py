@@ -20,7 +20,7 @@ from _common import run
 from _tuned import EVALUATION_SEED
 from scipy.optimize import minimize
 
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.plant.initial_states import sample_starts
 from cpjax.sim.rollout import measure
 from cpjax.sim.sweep import sweep
@@ -66,7 +66,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
             f"{cost / 1e6:.0f} M steps  {seconds:.0f} s",
             flush=True,
         )
-        io.write_json(out / "tune_baselines.json", {"versions": io.versions(), "rows": rows})
+        files.write_json(out / "tune_baselines.json", {"versions": files.versions(), "rows": rows})
     return rows
 
 

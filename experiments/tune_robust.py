@@ -19,7 +19,7 @@ import numpy as np
 from _common import run
 from _tuned import EVALUATION_SEED, QUICK, tuned
 
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.controllers import Hybrid
 from cpjax.numeric.statistics import wilson_interval
 from cpjax.plant import CartPole
@@ -77,7 +77,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
         rows.append(row)
         for label, key in ((only, "success_rate"), ("  located", "located_rate")):
             print(f"{label:20}" + "".join(f"{100 * row[name][key]:24.2f}" for name in controllers), flush=True)
-        io.write_json(out / "tune_robust.json", {"versions": io.versions(), "seed": seed, "rows": rows})
+        files.write_json(out / "tune_robust.json", {"versions": files.versions(), "seed": seed, "rows": rows})
     return rows
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from _common import run
 from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned
 
-from cpjax import io, paper
+from cpjax import files, io, paper
 from cpjax.controllers import Hybrid, StateFeedback
 from cpjax.paper.initial import initial_controller
 from cpjax.plant import CartPole, linearize
@@ -64,7 +64,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
             f"{row['value_steps'] / 1e6:.1f} M + {row['gradient_steps'] / 1e6:.2f} M steps  {row['seconds']:.0f} s",
             flush=True,
         )
-        io.write_json(out / "tune_seeds.json", {"versions": io.versions(), "rows": rows})
+        files.write_json(out / "tune_seeds.json", {"versions": files.versions(), "rows": rows})
     return rows
 
 

@@ -15,7 +15,7 @@ from typing import Any, get_args
 from _common import run
 from _tuned import EVALUATION_SEED, QUICK, located_rate, tuned
 
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.plant.initial_states import sample_starts
 from cpjax.sim.metrics import ProtocolMetrics
 from cpjax.sim.sweep import sweep
@@ -71,7 +71,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
             f"scores {', '.join(format(float(one['score']), '.2f') for _, _, one in tunings)}",
             flush=True,
         )
-        io.write_json(out / "tune_track.json", {"versions": io.versions(), "rows": rows})
+        files.write_json(out / "tune_track.json", {"versions": files.versions(), "rows": rows})
     return rows
 
 

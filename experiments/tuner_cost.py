@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from _common import run
 
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.cli.tables import print_table
 from cpjax.plant.initial_states import sample_starts
 from cpjax.plant.state import State
@@ -65,7 +65,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
         }
         weights[design] = {work: best["values"] / best[work] for work in WORK[1:]}
         print(f"{design}: a step with a gradient costs so many steps of the fastest values: {weights[design]}")
-    io.write_json(out / "tuner_cost.json", {"versions": io.versions(), "rows": rows, "weights": weights})
+    files.write_json(out / "tuner_cost.json", {"versions": files.versions(), "rows": rows, "weights": weights})
     return rows
 
 

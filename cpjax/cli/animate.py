@@ -5,19 +5,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cpjax import io
+from cpjax import files, io
+from cpjax.cli.builders import PLANT_OPTIONS, START_OPTIONS, build_plant, build_start, controller_title, named_hybrid
 from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import (
-    PLANT_OPTIONS,
-    START_OPTIONS,
-    Option,
-    add_options,
-    build_plant,
-    build_start,
-    controller_title,
-    named_hybrid,
-    resolve,
-)
+from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.controllers import Hybrid
@@ -121,7 +112,7 @@ def animated(
         save_animation(path, scenes, duration=duration, rate=chosen["rate"], report=report)
     document = {
         "what": "runs shown by the animation beside this file",
-        "versions": io.versions(),
+        "versions": files.versions(),
         "start": io.encode(start),
         "plant": io.encode(plant),
         "file": path.name,
@@ -141,7 +132,7 @@ def animated(
         },
         **others,
     }
-    io.write_json(out / "animation.json", document)
+    files.write_json(out / "animation.json", document)
     return path, runs
 
 

@@ -4,8 +4,9 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
+from cpjax.cli.builders import PLANT_OPTIONS, build_plant, parse_poles
 from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import PLANT_OPTIONS, Option, Sections, add_options, build_plant, parse_poles, resolve
+from cpjax.cli.options import Option, Sections, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table

@@ -5,17 +5,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from cpjax import io
+from cpjax import files, io
+from cpjax.cli.builders import CONTROLLER_OPTIONS, PLANT_OPTIONS, build_hybrid, build_plant
 from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import (
-    CONTROLLER_OPTIONS,
-    PLANT_OPTIONS,
-    Option,
-    add_options,
-    build_hybrid,
-    build_plant,
-    resolve,
-)
+from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
@@ -94,7 +87,7 @@ def audited(
         )
     loop = {"plant": io.encode(plant), "controller": io.encode(controller), "notes": notes}
     described = document(audit, starts, seed=seed, setting=setting, parameters=chosen.parameters, **loop)
-    io.write_json(out / "audit_gradients.json", described)
+    files.write_json(out / "audit_gradients.json", described)
 
     from cpjax.show.figures import save_figure
     from cpjax.show.gradients import picture

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cpjax import io
+from cpjax import files, io, workspace
+from cpjax.cli.builders import PLANT_OPTIONS, build_plant, controller_title, named_hybrid
 from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, controller_title, named_hybrid, resolve
+from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
@@ -118,13 +119,13 @@ def drawn(
     """
     request = {
         "what": "share of a map from which controllers settle: sampled, not certified",
-        "versions": io.versions(),
+        "versions": files.versions(),
         "map": dataclasses.asdict(chart),
         "run": setting,
         "plant": io.encode(plant),
         "controllers": {name: io.encode(one) for name, one in controllers.items()},
     }
-    with io.parts_of(parts, request):
+    with workspace.parts_of(parts, request):
         metrics = {name: mapped(parts, plant, chart, name, one, setting) for name, one in controllers.items()}
         rows = {name: document(chart, found) for name, found in metrics.items()}
 
@@ -133,11 +134,11 @@ def drawn(
 
         panels = [panel_of(plant, chart, name, one, metrics[name]) for name, one in controllers.items()]
         picture = png(basins(chart, panels))
-        files = {name: file_of(name) for name in controllers}
-        for file in files.values():
+        recorded = {name: file_of(name) for name in controllers}
+        for file in recorded.values():
             (parts / file).replace(out / file)
-        io.write_bytes(out / "basin.png", picture)
-        io.write_json(out / "basin.json", {**request, "basins": rows, "files": files, "notes": notes})
+        files.write_bytes(out / "basin.png", picture)
+        files.write_json(out / "basin.json", {**request, "basins": rows, "files": recorded, "notes": notes})
     return rows
 
 

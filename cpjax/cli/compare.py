@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from cpjax import io, paper
+from cpjax import files, io, paper
+from cpjax.cli.builders import EVALUATION_OPTIONS, PLANT_OPTIONS, build_plant, saved
 from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import EVALUATION_OPTIONS, PLANT_OPTIONS, Option, add_options, build_plant, resolve, saved
+from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
@@ -90,7 +91,7 @@ def compared(
     start, chosen_because = representative_start(starts, list(best_ones.values()))
     shown_start = {"state": io.encode(start), "is": chosen_because}
     described = document(plant, results, setting, track_limit=track_limit, shown_start=shown_start, notes=notes)
-    io.write_json(out / "compare.json", described)
+    files.write_json(out / "compare.json", described)
 
     from cpjax.show.comparison import by_start, phase_portraits, responses
     from cpjax.show.figures import save_figure

@@ -3,9 +3,10 @@
 import argparse
 from typing import Any
 
-from cpjax import io
+from cpjax import files, io
+from cpjax.cli.builders import CONTROLLER_OPTIONS, PLANT_OPTIONS, build_hybrid, build_plant
 from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import CONTROLLER_OPTIONS, PLANT_OPTIONS, add_options, build_hybrid, build_plant, resolve
+from cpjax.cli.options import add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.tables import print_table
 from cpjax.study.design_check import check_design, document
@@ -35,7 +36,7 @@ def run(given: argparse.Namespace) -> int:
     check = check_design(plant, regulator, controller.gate)
     path = given.out / "design.json"
     setting = {"seed": given.seed, "plant": io.encode(plant), "controller": io.encode(controller), "notes": notes}
-    io.write_json(path, document(check, **setting))
+    files.write_json(path, document(check, **setting))
 
     from cpjax.show.design import instability, picture, rows
     from cpjax.show.figures import save_figure

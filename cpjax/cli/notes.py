@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.cli.output import complain
 from cpjax.controllers import StateFeedback
 from cpjax.plant import CartPole, Motor
@@ -39,7 +39,7 @@ def plant_notes(given: Mapping[str, Any], plant: CartPole) -> list[str]:
     stated = {key for key in _MOTOR if key in given}
     whose = f"the {base} plant's"
     if base not in paper.PLANTS:
-        table = io.read_table(Path(base))
+        table = files.read_table(Path(base))
         table = table.get("plant", table) if "type" not in table else table
         motor = table.get("motor", {})
         stated |= set(motor) & set(_MOTOR)

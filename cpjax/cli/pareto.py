@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from cpjax import io, paper
+from cpjax import files, io, paper, workspace
+from cpjax.cli.builders import PLANT_OPTIONS, build_plant
 from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, resolve
+from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
@@ -99,13 +100,13 @@ def made(
     from cpjax.study.fronts.reference_point import reference_points
 
     request = {"plan": dataclasses.asdict(plan), "plant": io.encode(plant), "supplies": supplies}
-    with io.parts_of(parts, {**request, "versions": io.versions()}):
+    with workspace.parts_of(parts, {**request, "versions": files.versions()}):
         measure = reference_points(plant, plan, supplies)
         found = {design: traced(parts / design, plant, design, plan, supplies, measure) for design in DESIGNS}
         known = known_controllers(plant, plan)
         document = {
             "what": "mean settling time against mean cost, of controllers that no other found beats",
-            "versions": io.versions(),
+            "versions": files.versions(),
             "plan": dataclasses.asdict(plan),
             "plant": io.encode(plant),
             "fronts": found,
@@ -113,7 +114,7 @@ def made(
             "known": [{"name": name, "design": one.entry.design, **one.summary} for name, one in known],
         }
         draw(out, plant, found, known)
-        io.write_json(out / "pareto.json", document)
+        files.write_json(out / "pareto.json", document)
     return found
 
 
@@ -143,7 +144,7 @@ def traced(
     """Traces a design's fronts, saved in `folder`, from where an interrupted run goes on; returns plain values."""
     path = folder / "fronts.json"
     if path.exists():
-        return io.read_table(path)
+        return files.read_table(path)
 
     from cpjax.study.fronts.trace import trace_fronts  # imports optax, which is slow; other commands need none
 
@@ -178,7 +179,7 @@ def traced(
     ]
     steps = [{"supply": supply, **counted} for supply, counted in fronts.steps.items()]
     found = {"rows": rows, "steps": steps, "seconds": fronts.seconds}
-    io.write_json(path, found)
+    files.write_json(path, found)
     return found
 
 
@@ -205,8 +206,8 @@ def draw(out: Path, plant: CartPole, found: Found, controllers: list[tuple[str, 
                 baseline[row["cost"]][design] = np.asarray(row["bland"], float)
     supplies = {supply: designs for (supply, cost), designs in curves.items() if cost == "effort"}
     of_all_costs = png(fronts({cost: curves[own, cost] for cost in COSTS}, baseline, known))
-    io.write_bytes(out / "supplies.png", png(by_supply(supplies)))
-    io.write_bytes(out / "pareto.png", of_all_costs)
+    files.write_bytes(out / "supplies.png", png(by_supply(supplies)))
+    files.write_bytes(out / "pareto.png", of_all_costs)
 
 
 def curves_of(found: Found) -> "dict[tuple[float, str], dict[str, Curve]]":

@@ -5,8 +5,9 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from cpjax import __version__, io, paper
-from cpjax.cli.options import EVALUATION_OPTIONS, Option, add_options, resolve
+from cpjax import __version__, files, paper, workspace
+from cpjax.cli.builders import EVALUATION_OPTIONS
+from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.reproduce import print_rows, rows_of
 from cpjax.errors import InputError
@@ -44,8 +45,9 @@ def run(given: argparse.Namespace) -> int:
         raise InputError("cells", chosen["cells"], f"0, or a whole number from 2 to {MOST_CELLS}")
     setting = EvaluationConfig(seed=given.seed, **sections["evaluation"])
     per_axis, studies = chosen.get("cells", 192), chosen.get("studies", "quick")
-    asked = {"setting": dataclasses.asdict(setting), "cells": per_axis, "studies": studies, "versions": io.versions()}
-    with io.parts_of(given.out / "report.parts", asked) as parts:
+    asked = {"setting": dataclasses.asdict(setting), "cells": per_axis, "studies": studies}
+    asked["versions"] = files.versions()
+    with workspace.parts_of(given.out / "report.parts", asked) as parts:
         rows = written(given, parts, setting, per_axis, studies)
     print_rows(rows)
     say(f"wrote {given.out / 'report.html'}")

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.cli import basin, pareto
 from cpjax.cli.animate import animated, verdict
 from cpjax.cli.audit_gradients import audited
-from cpjax.cli.options import controller_title, named_hybrid
+from cpjax.cli.builders import controller_title, named_hybrid
 from cpjax.cli.progress import progress
 from cpjax.cli.tune import tuned
 from cpjax.controllers import AngleGate
@@ -56,7 +56,7 @@ def designs(page: Page, given: argparse.Namespace) -> None:
         for design in get_args(paper.Design)
         for gains in get_args(paper.Gains)
     }
-    io.write_json(given.out / "designs.json", {" ".join(key): document(check) for key, check in checks.items()})
+    files.write_json(given.out / "designs.json", {" ".join(key): document(check) for key, check in checks.items()})
     page.section("The two regulators as linear designs")
     page.text(
         "On the appendix's plant, linearised about upright, with the loop broken at the motor's voltage. Inside the "

@@ -4,7 +4,8 @@ import argparse
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cpjax.cli.options import EVALUATION_OPTIONS, add_options, resolve
+from cpjax.cli.builders import EVALUATION_OPTIONS
+from cpjax.cli.options import add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table

@@ -6,18 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from cpjax import io
+from cpjax import files, io
+from cpjax.cli.builders import CONTROLLER_OPTIONS, EVALUATION_OPTIONS, PLANT_OPTIONS, build_controller, build_plant
 from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import (
-    CONTROLLER_OPTIONS,
-    EVALUATION_OPTIONS,
-    PLANT_OPTIONS,
-    Option,
-    add_options,
-    build_controller,
-    build_plant,
-    resolve,
-)
+from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
 from cpjax.cli.tables import print_table
@@ -95,7 +87,7 @@ def run(given: argparse.Namespace) -> int:
     summary = summarise(metrics)
     document = {
         "what": "summary of a sweep",
-        "versions": io.versions(),
+        "versions": files.versions(),
         "seed": given.seed,
         "starts": name,
         "run": setting,
@@ -107,7 +99,7 @@ def run(given: argparse.Namespace) -> int:
         "seconds": seconds,
         **summary,
     }
-    io.write_json(given.out / "sweep.json", document)
+    files.write_json(given.out / "sweep.json", document)
     save_figure(given.out / "sweep.png", picture(starts, metrics))
     spread = summary["over_successes"]
     rows = [(cost, *(f"{spread[cost][key]:.4g}" for key in ("mean", "median", "max"))) for cost in COSTS]

@@ -8,19 +8,18 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cpjax import io
-from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import (
+from cpjax import files, io
+from cpjax.cli.builders import (
     CONTROLLER_OPTIONS,
     PLANT_OPTIONS,
     RUN_OPTIONS,
     START_OPTIONS,
-    add_options,
     build_controller,
     build_plant,
     build_start,
-    resolve,
 )
+from cpjax.cli.notes import announce, notes_on
+from cpjax.cli.options import add_options, resolve
 from cpjax.cli.output import say
 from cpjax.controllers import REGULATE, Hybrid
 from cpjax.errors import InputError
@@ -67,7 +66,7 @@ def run(given: argparse.Namespace) -> int:
     path = given.out / "swingup.json"
     document = {
         "what": "one closed-loop rollout",
-        "versions": io.versions(),
+        "versions": files.versions(),
         "seed": given.seed,
         "run": settings,
         "start": io.encode(start),
@@ -83,7 +82,7 @@ def run(given: argparse.Namespace) -> int:
             "mode": trajectory.mode,
         },
     }
-    io.write_json(path, document)
+    files.write_json(path, document)
 
     from cpjax.show.figures import response, save_figure  # matplotlib is slow; bad input should fail before
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from cpjax import io
+from cpjax import files, io
+from cpjax.cli.builders import PLANT_OPTIONS, build_plant, saved
 from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import PLANT_OPTIONS, Option, add_options, build_plant, numbers_of, resolve, saved
+from cpjax.cli.options import Option, add_options, numbers_of, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
@@ -126,7 +127,7 @@ def tuned(
     with progress("tune") as report:
         tuning = tune(plant, free, plan, progress=compiling(report, "loss"), checkpoint=checkpoint)
     io.save(out / "tuned.json", tuning.controller)
-    io.write_json(out / "tune.json", {**document(tuning, plant, free, plan), "notes": notes})
+    files.write_json(out / "tune.json", {**document(tuning, plant, free, plan), "notes": notes})
 
     from cpjax.show.figures import save_figure
     from cpjax.show.tuning import picture

@@ -57,6 +57,7 @@ class VoltageSignal:
 
     def update(self, memory: SignalMemory, measurement: object) -> tuple[SignalMemory, Scalar]:
         """Returns the new memory and the voltage of this instant [V]."""
+        # When a voltage begins is a control instant, which does not move with the times: they are only searched.
         times, voltages = lax.stop_gradient(jnp.asarray(self.times)), jnp.asarray(self.voltages)
         count = times.shape[0]
 

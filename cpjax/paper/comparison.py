@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from cpjax import io, paper
+from cpjax import files, io, paper
 from cpjax.controllers import Hybrid
 from cpjax.controllers.hybrid import without_design
 from cpjax.paper.reproduction import DESIGNS, GAINS, EvaluationConfig
@@ -116,7 +116,7 @@ def document(plant: CartPole, results: Sequence[Compared], setting: EvaluationCo
         for one in results
     ]
     return {
-        "versions": io.versions(),
+        "versions": files.versions(),
         "setting": dataclasses.asdict(setting),
         "plant": io.encode(plant),
         "rows": rows,

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from cpjax import io
+from cpjax import files, io
 from cpjax.errors import InputError
 from cpjax.paper.plant_fit import PARAMETERS, Fit, Progress, fit_all, linearised, random_starts, scale_of
 from cpjax.paper.printed_gains import PrintedGain
@@ -138,7 +138,7 @@ def document(audit: GainAudit, prints: Sequence[PrintedGain], plant: CartPole, *
 
     return {
         "what": "which changes of a plant explain printed gains; residuals in units of the last printed digit",
-        "versions": io.versions(),
+        "versions": files.versions(),
         "setting": setting,
         "printed": [{key: _plain(value) for key, value in dataclasses.asdict(p).items()} for p in prints],
         "plant": io.encode(plant),
@@ -154,7 +154,7 @@ def document(audit: GainAudit, prints: Sequence[PrintedGain], plant: CartPole, *
 
 def write(path: Path, audit: GainAudit, prints: Sequence[PrintedGain], plant: CartPole, **setting: Any) -> None:
     """Writes `document` as JSON, atomically."""
-    io.write_json(path, document(audit, prints, plant, **setting))
+    files.write_json(path, document(audit, prints, plant, **setting))
 
 
 def _plain(value: Any) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from cpjax import io, paper
+from cpjax import files, paper
 from cpjax.controllers.hybrid import without_design
 from cpjax.errors import InputError
 from cpjax.plant.initial_states import check_starts, sample_starts
@@ -100,7 +100,7 @@ def reproduce(
             progress(len(rows), len(todo), f"{variant.law}, {variant.plant}, {variant.design}, {variant.gains}")
         rows.append({**dataclasses.asdict(variant), **summarise(evaluate(variant, setting, starts))})
         if path is not None:
-            io.write_json(path, _document(setting, rows))
+            files.write_json(path, _document(setting, rows))
     if progress is not None:
         progress(len(todo), len(todo), "done")
     return rows
@@ -148,7 +148,7 @@ def trajectory(law: str, design: paper.Design, plant: str, start: State, setting
 def _document(setting: EvaluationConfig, rows: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "what": "the paper's controllers over a seeded set of starts",
-        "versions": io.versions(),
+        "versions": files.versions(),
         "setting": dataclasses.asdict(setting),
         "complete": len(rows) == len(variants()),
         "rows": rows,
@@ -160,7 +160,7 @@ def _resume(path: Path, setting: EvaluationConfig) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     try:
-        document = io.read_table(path)
+        document = files.read_table(path)
     except InputError:
         return []  # another kind of file, or broken: the first row overwrites it
     expected = _document(setting, [])

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
 
-from cpjax import io
+from cpjax import files
 from cpjax.controllers import REGULATE
 from cpjax.errors import InputError
 from cpjax.show.figures import as_text
@@ -83,11 +83,11 @@ def save_animation(
         allowed = f"at most {_MOST_PICTURES / rate:g} s for a GIF at this rate, {_MOST_PICTURES} pictures"
         raise InputError("duration", duration, allowed)
     if kind == "html":
-        io.write_text(path, page(scenes, duration, rate))
+        files.write_text(path, page(scenes, duration, rate))
     elif kind == "gif":
-        io.write_bytes(path, _gif(_pictures(scenes, duration, rate, report), rate))
+        files.write_bytes(path, _gif(_pictures(scenes, duration, rate, report), rate))
     else:
-        io.write_bytes(path, _mp4(_pictures(scenes, duration, rate, report), rate))
+        files.write_bytes(path, _mp4(_pictures(scenes, duration, rate, report), rate))
 
 
 def page(scenes: Sequence[Scene], duration: float, rate: float) -> str:

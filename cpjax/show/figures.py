@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cpjax import io
+from cpjax import files
 from cpjax.controllers import REGULATE, DesignName, Hybrid, PoleFactors
 from cpjax.sim.rollout import Trajectory
 
@@ -46,7 +46,7 @@ def png(figure: Figure) -> bytes:
 def save_figure(path: Path, figure: Figure) -> bytes:
     """Writes a PNG file atomically and returns its content."""
     content = png(figure)
-    io.write_bytes(path, content)
+    files.write_bytes(path, content)
     return content
 
 

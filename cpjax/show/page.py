@@ -5,7 +5,7 @@ import html
 from collections.abc import Sequence
 from pathlib import Path
 
-from cpjax import io
+from cpjax import files
 
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --paper: #ffffff; --soft: #5b6570; --line: #d8dee4; --band: #f4f6f8; }
@@ -73,7 +73,7 @@ class Page:
     def write(self, path: Path) -> None:
         """Writes the page atomically."""
         body = "\n".join(self._body)
-        io.write_text(
+        files.write_text(
             path,
             f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
             f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from cpjax import io
+from cpjax import files
 from cpjax.controllers import AngleGate, AngleRateGate, LyapunovGate, StateFeedback
 from cpjax.controllers.gates import Gate
 from cpjax.errors import InputError
@@ -115,7 +115,7 @@ def document(check: DesignCheck, **setting: Any) -> dict[str, Any]:
     """Returns the check as plain values, for JSON, beside the entries of `setting`."""
     return {
         "what": "a linear regulator on the plant's linear model about upright, behind a gate and a voltage limit",
-        "versions": io.versions(),
+        "versions": files.versions(),
         **setting,
         "K": check.K,
         "poles": [[p.real, p.imag] for p in check.poles],

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cpjax import io
+from cpjax import files
 from cpjax.controllers import Hybrid, SmoothClip, SmoothHybrid
 from cpjax.errors import InputError
 from cpjax.numeric.differences import Differences, central_differences
@@ -309,4 +309,4 @@ def document(audit: GradientAudit, starts: State, **setting: Any) -> dict[str, A
     columns = {name: np.asarray(getattr(starts, name)) for name in NAMES}
     fields = {f.name: getattr(audit, f.name) for f in dataclasses.fields(audit)}
     verdicts = [{"verdict": kind, "reason": reason} for kind, reason in audit.verdicts]
-    return {"versions": io.versions(), **setting, "starts": columns, **fields, "verdicts": verdicts}
+    return {"versions": files.versions(), **setting, "starts": columns, **fields, "verdicts": verdicts}

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from cpjax import io
+from cpjax import files, io, workspace
 from cpjax.controllers.protocol import Controller, Law, ModalController, as_controller
 from cpjax.errors import InputError
 from cpjax.sim.metrics import Fold
@@ -69,7 +69,7 @@ def record_sweep(
     run = {**simulation, "clock": work.kind.settings.clock}
     document = {
         "what": "closed-loop trajectories of many starts" if save_every else "metrics of many closed-loop runs",
-        "versions": io.versions(),
+        "versions": files.versions(),
         "about": dict(about or {}),
         "run": {key: value for key, value in run.items() if value is not None},
         "count": work.total,
@@ -84,7 +84,7 @@ def record_sweep(
         folder / f"part-{begin:09d}-{min(begin + work.size, work.total):09d}.npz" for begin in work.block_offsets()
     ]
     if first:
-        io.claim(folder / "sweep.json", {**document, "starts": _digest(work)})
+        workspace.claim(folder / "sweep.json", {**document, "starts": _digest(work)})
     done = np.array([part.exists() for part in parts])
     if jax.process_count() > 1:
         done = np.asarray(multihost_utils.broadcast_one_to_all(done))
@@ -94,7 +94,7 @@ def record_sweep(
             columns = _columns(next(computed))
             if first:
                 own = _starts(work, begin, begin + work.size) if save_every else {}
-                io.write_bytes(part, _npz({**own, **columns}))
+                files.write_bytes(part, _npz({**own, **columns}))
         if progress is not None:
             progress(min(begin + work.size, work.total), work.total)
     if save_every or not first:
@@ -114,7 +114,7 @@ def read_sweep(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]
     path = _checked_path(path, trajectories=False)
     try:
         if path.suffix == ".json":
-            table = io.read_table(path)
+            table = files.read_table(path)
             return table["document"], {name: np.asarray(values) for name, values in table["columns"].items()}
         if path.suffix == ".npz":
             with np.load(path) as archive:
@@ -198,15 +198,15 @@ def _assemble(path: Path, folder: Path, parts: list[Path], document: dict[str, A
     results = {name: np.concatenate([one[name] for one in loaded]) for name in loaded[0]}
     columns = {**_starts(work, 0, work.total), **results}
     if path.suffix == ".json":
-        io.write_json(path, {"document": document, "columns": columns})
+        files.write_json(path, {"document": document, "columns": columns})
     elif path.suffix == ".npz":
-        io.write_bytes(path, _npz({_DOCUMENT: np.asarray(io.dump_json(document)), **columns}))
+        files.write_bytes(path, _npz({_DOCUMENT: np.asarray(files.dump_json(document)), **columns}))
     else:
         arrow = _pyarrow()
         table = arrow.table({name: column if column.ndim == 1 else column.tolist() for name, column in columns.items()})
-        table = table.replace_schema_metadata({_DOCUMENT: io.dump_json(document)})
+        table = table.replace_schema_metadata({_DOCUMENT: files.dump_json(document)})
         buffer = buffers.BytesIO()
         arrow.parquet.write_table(table, buffer)
-        io.write_bytes(path, buffer.getvalue())
-    io.release(folder)
+        files.write_bytes(path, buffer.getvalue())
+    workspace.release(folder)
     return jax.tree.unflatten(work.structure(), list(results.values()))

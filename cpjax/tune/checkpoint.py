@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cpjax import io
+from cpjax import files
 from cpjax.errors import InputError
 
 Numbers = np.ndarray[Any, Any]
@@ -55,7 +55,7 @@ def store(path: Path | None, identity: str, memory: TunerState) -> None:
     buffer = buffers.BytesIO()
     arrays["note"] = np.frombuffer(note.encode(), dtype=np.uint8)
     np.savez(buffer, allow_pickle=False, **arrays)
-    io.write_bytes(path, buffer.getvalue())
+    files.write_bytes(path, buffer.getvalue())
 
 
 def restore(path: Path | None, identity: str, optimiser: optax.GradientTransformation) -> TunerState | None:

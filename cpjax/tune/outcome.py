@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from cpjax import io
+from cpjax import files, io
 from cpjax.controllers import Hybrid
 from cpjax.numeric.statistics import wilson_interval
 from cpjax.plant import CartPole
@@ -50,7 +50,7 @@ class Tuning:
 def request(plant: CartPole, free: FreeParameters, plan: TuningConfig) -> dict[str, Any]:
     """Returns all that a tuning depends on, as plain values: equal requests give equal bits on one machine."""
     return {
-        "versions": io.versions(),
+        "versions": files.versions(),
         "plan": plan.table(),
         "plant": io.encode(plant),
         "start_from": io.encode(free.controller),

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cpjax import io
+from cpjax import files
 from cpjax.controllers import Hybrid, StateFeedback
 from cpjax.plant import CartPole, linearize
 from cpjax.plant.initial_states import sample_starts
@@ -98,7 +98,7 @@ class _Tuner:
         self.validated = self._runs(duration=plan.horizon, dt=plan.horizon_dt, clock="sampled")
         self.evaluated = self._runs(duration=plan.final_horizon, dt=plan.final_dt, clock="sampled")
         self.located_runs = self._runs(**self.located)
-        self.identity = io.dump_json(request(plant, free, plan))
+        self.identity = files.dump_json(request(plant, free, plan))
 
     def _runs(self, **settings: Any) -> Any:
         """Returns a compiled map from controllers, initial states and plants (or None), each (n,), to metrics (n,)."""

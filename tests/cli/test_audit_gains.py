@@ -7,8 +7,8 @@ import pytest
 from tables import rows
 
 import cpjax.show.figures
-from cpjax import AngleGate, LyapunovGate, io, linearize, lqr, paper, place
-from cpjax.cli.options import build_controller, parse_poles
+from cpjax import AngleGate, LyapunovGate, files, io, linearize, lqr, paper, place
+from cpjax.cli.builders import build_controller, parse_poles
 from cpjax.paper import gain_identification
 from cpjax.paper.gain_identification import Direction, GainAudit, audit_gains, document
 from cpjax.paper.plant_fit import PARAMETERS, Fit
@@ -25,7 +25,7 @@ PNG = b"\x89PNG\r\n"
 
 @pytest.fixture
 def no_pictures(monkeypatch):
-    monkeypatch.setattr(cpjax.show.figures, "save_figure", lambda path, _: io.write_bytes(path, PNG))
+    monkeypatch.setattr(cpjax.show.figures, "save_figure", lambda path, _: files.write_bytes(path, PNG))
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def strict_json(path):
 
 
 def as_plain(value):
-    return json.loads(io.dump_json(value))
+    return json.loads(files.dump_json(value))
 
 
 # --- audit-gains ------------------------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ from cpjax import (
 )
 from cpjax.cli import main, report_sections
 from cpjax.cli.basin import CONTROLLERS, file_of
-from cpjax.cli.options import controller_title
+from cpjax.cli.builders import controller_title
 from cpjax.cli.reproduce import print_rows
 from cpjax.cli.swingup import OPTIONS
 from cpjax.paper import reproduction

@@ -8,7 +8,7 @@ import pytest
 from tables import rows
 
 import cpjax
-from cpjax import io, paper
+from cpjax import files, io, paper
 from cpjax.cli.compare import representative_start
 from cpjax.controllers import LqrWeights, PoleFactors
 from cpjax.errors import InputError
@@ -74,7 +74,7 @@ def test_a_tuning_that_settles_from_no_start_says_so_in_its_exit_code(tmp_path, 
     assert done.code == 1, done.err
     assert "0.00 %" in done.out
     assert "nan" not in done.out
-    assert io.read_table(tmp_path / "tune.json")["success_rate"] == 0.0
+    assert files.read_table(tmp_path / "tune.json")["success_rate"] == 0.0
 
 
 @rows(("option", "value"), [("--design", "lqr"), ("--gate", "lyapunov")])

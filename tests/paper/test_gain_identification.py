@@ -15,7 +15,7 @@ from scipy.signal import place_poles
 from tables import rows
 
 import cpjax
-from cpjax import CartPole, InputError, Motor, io, linearize, paper
+from cpjax import CartPole, InputError, Motor, files, linearize, paper
 from cpjax.paper import gain_identification, plant_fit
 from cpjax.paper.gain_identification import Direction, GainAudit, audit_gains, document, write
 from cpjax.paper.plant_fit import PARAMETERS, Fit, least_squares
@@ -355,7 +355,7 @@ def test_a_set_from_which_no_start_leads_anywhere_explains_nothing(monkeypatch):
     assert audit.best(1) is audit.fits[1]
     assert audit.plant.motor.back_emf_constant == audit.fits[1].values[0]
     assert "back_emf_constant" in " ".join(findings(audit))
-    assert io.dump_json(document(audit, printed_in_the_paper(), APPENDIX))
+    assert files.dump_json(document(audit, printed_in_the_paper(), APPENDIX))
 
 
 def test_more_fits_than_run_side_by_side_are_those_of_one_go(monkeypatch):
@@ -431,14 +431,14 @@ def plain(value):
     def forbidden(token):
         raise AssertionError(f"{token} is no JSON")
 
-    return json.loads(io.dump_json(value), parse_constant=forbidden)
+    return json.loads(files.dump_json(value), parse_constant=forbidden)
 
 
 def test_the_document_is_strict_json_that_tells_the_audit_back(papers, tmp_path):
     prints = printed_in_the_paper()
     table = plain(document(papers, prints, APPENDIX, seed=3, parameters=PAIR))
     assert table["setting"] == {"seed": 3, "parameters": list(PAIR)}
-    assert table["versions"] == io.versions()
+    assert table["versions"] == files.versions()
     fits = [Fit(tuple(f["parameters"]), tuple(f["values"]), tuple(f["residuals"]), f["reached"]) for f in table["fits"]]
     assert tuple(fits) == papers.fits
     assert [f["worst"] for f in table["fits"]] == [fit.worst for fit in papers.fits]
@@ -451,7 +451,7 @@ def test_the_document_is_strict_json_that_tells_the_audit_back(papers, tmp_path)
         assert (row["Q"], row["R"]) == (printed.Q and list(printed.Q), printed.R)
         assert (row["poles"] and tuple(map(complex, row["poles"]))) == printed.poles
     for key, plant in (("plant", APPENDIX), ("found", papers.plant)):
-        io.write_json(tmp_path / f"{key}.json", table[key])
+        files.write_json(tmp_path / f"{key}.json", table[key])
         again = cpjax.load(tmp_path / f"{key}.json")
         assert all(value_of(again, n) == value_of(plant, n) for n in (*PARAMETERS, "voltage_limit"))
     write(tmp_path / "audit.json", papers, prints, APPENDIX, seed=3, parameters=PAIR)

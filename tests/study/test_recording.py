@@ -12,7 +12,7 @@ import pytest
 from extensions import dead_time
 
 import cpjax
-from cpjax import InputError, io, paper, read_sweep, record_sweep
+from cpjax import InputError, files, io, paper, read_sweep, record_sweep
 from cpjax.study import recording
 
 PLANT = paper.appendix_plant()
@@ -38,7 +38,7 @@ def test_a_file_has_the_sweeps_results_its_starts_and_where_they_come_from(suffi
     np.testing.assert_array_equal(columns["start.theta"], STARTS.theta)
     assert document["about"] == {"seed": 3}
     assert document["run"] == {"duration": 0.1, "dt": 0.002, "clock": "sampled"}
-    assert document["versions"] == io.versions()
+    assert document["versions"] == files.versions()
     assert document["plant"] == io.encode(PLANT)
     assert document["controller"]["type"] == "Hybrid"
     again = tmp_path / f"again{suffix}"
@@ -59,7 +59,7 @@ def test_trajectories_go_to_a_folder_block_by_block(tmp_path):
         np.testing.assert_array_equal(part["state.theta"], whole.state.theta[32:64])
         np.testing.assert_array_equal(part["start.x"], STARTS.x[32:64])
         np.testing.assert_array_equal(part["metrics.effort"], whole.metrics.effort[32:64])
-    assert io.read_table(tmp_path / "runs" / "sweep.json")["plant"]["type"] == "CartPole"
+    assert files.read_table(tmp_path / "runs" / "sweep.json")["plant"]["type"] == "CartPole"
 
 
 class InterruptedSweepError(Exception):

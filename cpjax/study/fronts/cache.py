@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cpjax import io
+from cpjax import files
 from cpjax.study.fronts.evaluator import Evaluated
 
 _COUNTS = ("begun", "values", "gradients")
@@ -53,5 +53,5 @@ def load_or_run(path: Path | None, search: Callable[[], Search]) -> Search:
         content: dict[str, Any] = {"supplies": np.array([*found.met]), "seconds": found.seconds, **counts, **columns}
         buffer = buffers.BytesIO()
         np.savez(buffer, **content)
-        io.write_bytes(path, buffer.getvalue())
+        files.write_bytes(path, buffer.getvalue())
     return found
