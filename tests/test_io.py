@@ -30,9 +30,11 @@ from cpjax import (
     ProtocolMetrics,
     State,
     StateFeedback,
+    files,
     io,
     paper,
     rollout,
+    workspace,
 )
 from cpjax.controllers import SingleLaw, SmoothClip, SmoothHybrid
 from cpjax.sim.rollout import Trajectory
@@ -418,21 +420,21 @@ def test_a_state_of_other_things_than_numbers_is_refused_by_name(tmp_path, name,
 @rows("value", [None, "a text", {"type": "Motor"}], ids=str)
 def test_metrics_of_other_things_than_numbers_are_refused_by_name(tmp_path, field, value):
     table = {**io.encode(METRICS), field: value}
-    io.write_json(tmp_path / "metrics.json", table)
+    files.write_json(tmp_path / "metrics.json", table)
     with refused(f"Metrics.{field}", "a number or an array of numbers"):
         io.load(tmp_path / "metrics.json")
 
 
 @rows(("field", "value"), [("state", 1.0), ("state", {"type": "Motor"}), ("metrics", "x"), ("time", {"type": "Motor"})])
 def test_a_trajectory_of_other_parts_is_refused_by_name(tmp_path, field, value):
-    io.write_json(tmp_path / "run.json", {**io.encode(THINGS["Trajectory"]), field: value})
+    files.write_json(tmp_path / "run.json", {**io.encode(THINGS["Trajectory"]), field: value})
     with refused(f"Trajectory.{field}"):
         io.load(tmp_path / "run.json")
 
 
 def test_a_result_of_a_command_is_no_component_but_has_parts(tmp_path):
     path = tmp_path / "result.json"
-    io.write_json(path, {"what": "one closed-loop rollout", "plant": io.encode(PLANT), "controller": io.encode(LAW)})
+    files.write_json(path, {"what": "one closed-loop rollout", "plant": io.encode(PLANT), "controller": io.encode(LAW)})
     with refused("path", "a file with one component; this one holds a result (one closed-loop rollout)"):
         io.load(path)
     assert_bits(io.load_part(path, "plant", "a CartPole"), PLANT)
@@ -583,20 +585,20 @@ def test_plain_tables_come_back_with_their_infinities_and_as_strict_json(tmp_pat
         "e": [],
         "f": "x [1,\n 2]",
     }
-    io.write_json(path, data)
+    files.write_json(path, data)
     strict_json(path.read_text(encoding="utf-8"))
     expected = {"a": [1.5, math.inf, -math.inf], "b": {"c": [0, 1, 2], "d": 0.5}, "e": [], "f": "x [1,\n 2]"}
-    assert io.read_table(path) == expected
+    assert files.read_table(path) == expected
 
 
 def test_lists_of_numbers_stand_on_one_line(tmp_path):
-    assert io.dump_json({"a": [1, 2], "b": [[1.0, 2.0], [3.0, 4.0]]}).count("\n") < 12
-    assert "[ 1, 2 ]" in io.dump_json({"a": [1, 2]})
+    assert files.dump_json({"a": [1, 2], "b": [[1.0, 2.0], [3.0, 4.0]]}).count("\n") < 12
+    assert "[ 1, 2 ]" in files.dump_json({"a": [1, 2]})
 
 
 def test_versions_name_what_a_result_depends_on():
-    assert set(io.versions()) == {"cpjax", "jax", "jaxlib", "numpy", "scipy"}
-    assert io.versions()["numpy"] == np.__version__
+    assert set(files.versions()) == {"cpjax", "jax", "jaxlib", "numpy", "scipy"}
+    assert files.versions()["numpy"] == np.__version__
 
 
 def test_versions_of_a_tree_that_was_never_installed_are_unknown(monkeypatch):
@@ -606,7 +608,7 @@ def test_versions_of_a_tree_that_was_never_installed_are_unknown(monkeypatch):
         return "1.0"
 
     monkeypatch.setattr(importlib.metadata, "version", version)
-    assert io.versions() == {"cpjax": "0+unknown", "jax": "1.0", "jaxlib": "1.0", "numpy": "1.0", "scipy": "1.0"}
+    assert files.versions() == {"cpjax": "0+unknown", "jax": "1.0", "jaxlib": "1.0", "numpy": "1.0", "scipy": "1.0"}
 
 
 def test_a_relative_path_without_a_folder_is_written_here(tmp_path, monkeypatch):
@@ -619,7 +621,7 @@ def test_parts_of_a_work_stay_when_it_is_stopped_and_are_refused_to_any_other(tm
     folder = tmp_path / "parts"
 
     def work(request, saved, stop=None):
-        with io.parts_of(folder, request) as parts:
+        with workspace.parts_of(folder, request) as parts:
             found = sorted(path.name for path in parts.iterdir())
             if saved:
                 (parts / saved).write_text("done")
@@ -640,14 +642,14 @@ def test_parts_of_a_work_stay_when_it_is_stopped_and_are_refused_to_any_other(tm
 
 
 def test_a_claim_alone_in_its_folder_gives_way(tmp_path):
-    io.claim(tmp_path / "parts" / "request.json", {"seed": 1})
-    io.claim(tmp_path / "parts" / "request.json", {"seed": 2})
+    workspace.claim(tmp_path / "parts" / "request.json", {"seed": 1})
+    workspace.claim(tmp_path / "parts" / "request.json", {"seed": 2})
     assert json.loads((tmp_path / "parts" / "request.json").read_text()) == {"seed": 2}
 
 
 def test_a_stopped_removal_leaves_nothing_that_a_claim_could_take_for_its_parts(tmp_path, monkeypatch):
     folder = tmp_path / "parts"
-    io.claim(folder / "request.json", {"seed": 1})
+    workspace.claim(folder / "request.json", {"seed": 1})
     (folder / "first").write_text("done")
 
     def stop(*_):
@@ -656,7 +658,7 @@ def test_a_stopped_removal_leaves_nothing_that_a_claim_could_take_for_its_parts(
     with monkeypatch.context() as patch:
         patch.setattr("shutil.rmtree", stop)
         with pytest.raises(KeyboardInterrupt):
-            io.release(folder)
+            workspace.release(folder)
     assert not folder.exists()
 
 
@@ -664,4 +666,4 @@ def test_a_claim_at_an_impossible_place_is_bad_input(tmp_path):
     (tmp_path / "file").write_text("")
     for place in (tmp_path / "file" / "parts", tmp_path / ("o" * 300)):
         with pytest.raises(InputError, match="a place that can be written"):
-            io.claim(place / "request.json", {})
+            workspace.claim(place / "request.json", {})

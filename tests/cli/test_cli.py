@@ -28,6 +28,7 @@ from cpjax import (
     Motor,
     State,
     StateFeedback,
+    files,
     io,
     paper,
     rollout,
@@ -53,7 +54,7 @@ def no_pictures(monkeypatch):
     """Drawing is slow and is not what the test is about."""
     monkeypatch.setattr(cpjax.show.figures, "response", lambda *_: None)
     monkeypatch.setattr(cpjax.show.figures, "success_rates", lambda *_: None)
-    monkeypatch.setattr(cpjax.show.figures, "save_figure", lambda path, _: io.write_bytes(path, PNG) or PNG)
+    monkeypatch.setattr(cpjax.show.figures, "save_figure", lambda path, _: files.write_bytes(path, PNG) or PNG)
     monkeypatch.setattr(cpjax.show.figures, "png", lambda _: PNG)
     monkeypatch.setattr(cpjax.show.reproduction, "pictures", lambda _: [("one", None, "A caption.")])
 
@@ -68,12 +69,12 @@ def strict_json(path):
 def document(folder, name="swingup.json"):
     """The result's JSON without what may differ between two equal runs."""
     strict_json(folder / name)
-    return io.read_table(folder / name)
+    return files.read_table(folder / name)
 
 
 def as_plain(value):
     """A result as the JSON file holds it."""
-    return io._numbers(json.loads(io.dump_json(value)))
+    return files._numbers(json.loads(files.dump_json(value)))
 
 
 def assert_notes(result, *beginnings):
@@ -140,7 +141,7 @@ def test_the_json_of_a_swing_up_is_the_rollout_of_the_library(command, tmp_path,
     run = rollout(plant, controller, start, duration=12.0, dt=0.01, clock="sampled")
     assert table["seed"] == 4
     assert table["run"] == {"duration": 12.0, "dt": 0.01, "clock": "sampled"}
-    assert table["versions"] == io.versions()
+    assert table["versions"] == files.versions()
     assert table["start"] == as_plain(io.encode(start))
     assert table["plant"] == as_plain(io.encode(plant))
     assert table["controller"] == as_plain(io.encode(controller))
@@ -156,9 +157,9 @@ def test_plant_and_controller_saved_from_a_run_give_the_same_run_again(command, 
     command("swingup", "--out", tmp_path / "a", *SHORT, "--cart-mass", "1.5", "--energy-gain", "3", "--design", "lqr")
     first = document(tmp_path / "a")
     for name in ("plant", "controller"):
-        io.write_json(tmp_path / f"{name}.json", first[name])
-    files = ("--plant", tmp_path / "plant.json", "--controller", tmp_path / "controller.json")
-    command("swingup", "--out", tmp_path / "b", *SHORT, *files)
+        files.write_json(tmp_path / f"{name}.json", first[name])
+    saved = ("--plant", tmp_path / "plant.json", "--controller", tmp_path / "controller.json")
+    command("swingup", "--out", tmp_path / "b", *SHORT, *saved)
     assert document(tmp_path / "b") == first
 
 
@@ -425,7 +426,7 @@ def workplace(tmp_path, monkeypatch):
     io.save(tmp_path / "controller.json", Hybrid(law, law, AngleGate(0.5)))
     wanders = io.encode(Hybrid(law, law, AngleGate(0.5)))
     wanders["regulator"]["reference"]["x"] = math.nan
-    io.write_json(tmp_path / "wanders.json", wanders)
+    files.write_json(tmp_path / "wanders.json", wanders)
     io.save(tmp_path / "batch.json", jax.tree.map(lambda leaf: np.array([leaf, leaf]), plant))
     (tmp_path / "list.json").write_text("[1, 2]", encoding="utf-8")
     (tmp_path / "broken.toml").write_text("[motor", encoding="utf-8")
@@ -611,7 +612,7 @@ def test_a_reproduction_writes_its_rows_and_pictures_and_nothing_else(reproduced
         assert (reproduced.folder / name).read_bytes().startswith(PNG)
     table = strict_json(reproduced.folder / "reproduction.json")
     assert table["complete"] is True
-    assert table["versions"] == io.versions()
+    assert table["versions"] == files.versions()
     assert table["setting"] == {"starts": "hanging", "count": 8, "seed": 1, "duration": 12.0, "dt": 0.01}
 
 
@@ -736,7 +737,7 @@ def test_a_complete_run_is_computed_anew(partial):
     ],
 )
 def test_a_file_of_another_version_or_kind_is_not_taken_over(partial, damage):
-    io.write_json(partial.path, damage(io.read_table(partial.path)))
+    files.write_json(partial.path, damage(files.read_table(partial.path)))
     assert partial.again() == 32
 
 

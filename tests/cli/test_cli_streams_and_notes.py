@@ -23,6 +23,7 @@ from cpjax import (
     InputError,
     Motor,
     StateFeedback,
+    files,
     io,
     linearize,
     paper,
@@ -39,7 +40,7 @@ SHORT = ("--duration", "0.1", "--dt", "0.01")
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch):
     monkeypatch.setattr(cpjax.show.figures, "response", lambda *_: None)
-    monkeypatch.setattr(cpjax.show.figures, "save_figure", lambda path, _: io.write_bytes(path, b"") or b"")
+    monkeypatch.setattr(cpjax.show.figures, "save_figure", lambda path, _: files.write_bytes(path, b"") or b"")
 
 
 def notes_of(result):
@@ -217,7 +218,7 @@ def test_a_folder_with_control_characters_is_shown_with_escapes(command, tmp_pat
 
 
 def gain(folder):
-    return np.asarray(io.read_table(folder / "design.json")["K"])
+    return np.asarray(files.read_table(folder / "design.json")["K"])
 
 
 @rows("design", ["placement", "lqr"])
@@ -245,14 +246,14 @@ def test_printed_gains_asked_for_on_another_plant_are_printed_and_said_to_be(com
     result = command("design", "--cart-mass", "1.2", "--gains", "printed", "--out", tmp_path)
     assert result.code == 0
     np.testing.assert_array_equal(gain(tmp_path), [paper.PRINTED_GAINS["placement"]])
-    assert notes_of(result) == io.read_table(tmp_path / "design.json")["notes"]
+    assert notes_of(result) == files.read_table(tmp_path / "design.json")["notes"]
     assert notes_of(result)[0].startswith("the controller has the gain that the paper prints for its own plant")
 
 
 def test_a_preset_on_another_plant_is_said_to_be_made_for_another(command, tmp_path):
     result = command("swingup", *SHORT, "--controller", "tuned_lqr", "--pole-length", "0.6", "--out", tmp_path)
     expected = "the controller was made for another plant: its model differs in pole_length (0.7 there, 0.6 here)"
-    assert notes_of(result) == io.read_table(tmp_path / "swingup.json")["notes"] == [expected]
+    assert notes_of(result) == files.read_table(tmp_path / "swingup.json")["notes"] == [expected]
     result = command("swingup", *SHORT, "--controller", "tuned_lqr", "--out", tmp_path)
     assert result.err == ""
 
@@ -324,7 +325,7 @@ def test_a_motor_given_in_part_is_said_to_have_the_papers_rotor_and_what_that_we
         assert "the rotor weighs 43.8 kg at the cart" in note
         assert "damps the cart with 6.25e+06 N s/m" in note
         assert "gear_ratio =" not in note
-        assert io.read_table(tmp_path / "design.json")["notes"] == [note]
+        assert files.read_table(tmp_path / "design.json")["notes"] == [note]
 
 
 def test_a_motor_given_in_full_or_not_at_all_or_another_supply_is_worth_no_note(command, tmp_path):
@@ -352,7 +353,7 @@ def test_a_full_state_weight_is_taken_from_a_file_and_from_flags(command, tmp_pa
         result = command("design", *given, "--out", tmp_path)
         assert (result.code, result.err) == (0, "")
         np.testing.assert_array_equal(gain(tmp_path), expected)
-        assert io.read_table(tmp_path / "design.json")["controller"]["regulator"]["design"]["Q"] == FULL
+        assert files.read_table(tmp_path / "design.json")["controller"]["regulator"]["design"]["Q"] == FULL
 
 
 @rows(
@@ -403,7 +404,7 @@ def test_the_results_of_commands_are_plants_and_controllers_for_others(command, 
     again = tmp_path / "b" / "swingup.json"
     done = command("design", "--plant", again, "--controller", again, "--out", tmp_path / "c")
     assert (done.code, done.err) == (0, "")
-    first, last = (io.read_table(path) for path in (result, tmp_path / "c" / "design.json"))
+    first, last = (files.read_table(path) for path in (result, tmp_path / "c" / "design.json"))
     assert first == last
 
 
