@@ -5,10 +5,11 @@
 Checks the older commit out beside this one and gives each a process of its own, which stays. Every case is compiled in
 both and then run in turn, old, new, new, old, so that a busy machine disturbs both alike. Prints the medians and the
 median ratio of neighbouring laps: above 1 this commit is faster. The cases name every argument: defaults may differ.
+Sweeps and single runs come after `configure_cpu()`; gradients after it and after `configure_cpu(gradients=True)`,
+which leaves the compiler's options as they are.
 """
 
 import argparse
-import dataclasses
 import functools
 import json
 import os
@@ -48,15 +49,14 @@ def cases(configured: bool = True) -> Cases:
     declared = getattr(cpjax, "Simulation", None)
     plain = common | ({"derivative": "pathwise"} if declared and "derivative" in declared.__annotations__ else {})
 
-    def outside(gain: Any, start: Any, settings: dict[str, Any]) -> Any:
-        law = dataclasses.replace(controller.swing_up, energy_gain=gain)
-        moved = dataclasses.replace(controller, swing_up=law)
-        return cpjax.measure(plant, moved, start, metrics=cpjax.TimeOutside(), **settings)
+    def outside(law: Any, start: Any, settings: dict[str, Any]) -> Any:
+        return cpjax.measure(plant, law, start, metrics=cpjax.TimeOutside(), **settings)
 
     def batched(settings: dict[str, Any], differentiate: bool) -> Callable[..., Any]:
-        def one(gain: Any, start: Any) -> Any:
-            return outside(gain, start, settings)
+        def one(law: Any, start: Any) -> Any:
+            return outside(law, start, settings)
 
+        # In every number of the law: a derivative in one of them can miss what slows the others.
         return jax.jit(jax.vmap(jax.value_and_grad(one) if differentiate else one, in_axes=(None, 0)))
 
     found: Cases = {}
@@ -66,16 +66,18 @@ def cases(configured: bool = True) -> Cases:
             starts = jax.tree.map(functools.partial(jnp.asarray, dtype=dtype), drawn[count])
             sweep = functools.partial(cpjax.sweep, plant, controller, starts, **common)
             found[f"sweep of {count}, {dtype.__name__}"] = sweep, count * 2e-3, 65_536 // count // 4 or 1
-    starts, gain = cpjax.sample_starts("hanging", 64, seed=1), jnp.asarray(controller.swing_up.energy_gain)
+    starts, law = cpjax.sample_starts("hanging", 64, seed=1), jax.tree.map(jnp.asarray, controller)
     for name, settings, differentiate in (
         ("gradient of 64", plain, True),
+        ("gradient of 64, every step kept", plain | {"checkpoint": "every_step"}, True),
+        ("gradient of 64, continuous clock", plain | {"clock": "continuous"}, True),
         ("located values of 64", located, False),
         ("located gradient of 64", located, True),
     ):
-        found[name] = functools.partial(batched(settings, differentiate), gain, starts), 64 * 2e-3, 4
+        found[name] = functools.partial(batched(settings, differentiate), law, starts), 64 * 2e-3, 4
     start = cpjax.State(0.0, 0.0, np.pi - 0.01, 0.0)
-    measure = jax.jit(lambda gain: outside(gain, start, plain))
-    found["one measure under jit"] = lambda: measure(gain), 1e-6, 100
+    measure = jax.jit(lambda law: outside(law, start, plain))
+    found["one measure under jit"] = lambda: measure(law), 1e-6, 100
     found["one measure"] = lambda: cpjax.measure(plant, controller, start, **common), 1e-6, 100
     found["one rollout"] = lambda: cpjax.rollout(plant, controller, start, **common).state.x, 1e-6, 100
     return found
@@ -139,10 +141,18 @@ def main(out: Path, quick: bool = False, against: str = "HEAD", laps: int = 20, 
         old = Path(folder) / "old"
         subprocess.run(["git", "worktree", "add", "--quiet", "--detach", str(old), against], cwd=here, check=True)
         try:
-            both = {"old": Child(old, folder), "new": Child(here, folder)}
             work = {name: work for name, (_, work, _) in cases().items()}
-            for name in [name for name in both["new"].names if case in name][:: 4 if quick else 1]:
-                row: dict[str, Any] = {"case": name}
+            asked = [(name, True) for name in work] + [(name, False) for name in work if "gradient" in name]
+            children: dict[bool, dict[str, Child]] = {}
+            for name, configured in [each for each in asked if case in each[0]][:: 4 if quick else 1]:
+                if configured not in children:
+                    options = () if configured else ("--unconfigured",)
+                    trees = {"old": old, "new": here}
+                    children[configured] = {
+                        which: Child(tree, folder, options=options) for which, tree in trees.items()
+                    }
+                both = children[configured]
+                row: dict[str, Any] = {"case": name if configured else f"{name}, no options"}
                 row |= {f"first_{which}": child.seconds(name) for which, child in both.items()}
                 seconds: dict[str, list[float]] = {"old": [], "new": []}
                 for lap in range(2 if quick else laps):
@@ -152,8 +162,8 @@ def main(out: Path, quick: bool = False, against: str = "HEAD", laps: int = 20, 
                 row |= {which: work[name] / float(np.median(seconds[which])) for which in both}
                 row |= {"ratio": float(np.median(ratios)), "quartiles": np.quantile(ratios, (0.25, 0.75)).tolist()}
                 rows.append(row)
-                print(f"{name}: {row['ratio']:.3f}", file=sys.stderr)
-            for child in both.values():
+                print(f"{row['case']}: {row['ratio']:.3f}", file=sys.stderr)
+            for child in [child for both in children.values() for child in both.values()]:
                 child.process.kill()
         finally:
             subprocess.run(["git", "worktree", "remove", "--force", str(old)], cwd=here, check=True)
@@ -181,8 +191,9 @@ if __name__ == "__main__":
     parser.add_argument("--case", default="", help="only the cases whose name holds this text")
     parser.add_argument("--quick", action="store_true", help="a small version that only shows that it works")
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--unconfigured", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.child:
-        answer(cases())
+        answer(cases(not given.unconfigured))
     else:
         main(given.out, given.quick, given.against, given.laps, given.case)

@@ -35,7 +35,7 @@ stablehlo.cbrt stablehlo.ceil stablehlo.clamp stablehlo.compare stablehlo.concat
 stablehlo.convert stablehlo.cosine stablehlo.divide stablehlo.dynamic_slice stablehlo.dynamic_update_slice
 stablehlo.exponential stablehlo.exponential_minus_one stablehlo.floor stablehlo.iota stablehlo.is_finite
 stablehlo.log stablehlo.log_plus_one stablehlo.logistic stablehlo.maximum stablehlo.minimum stablehlo.multiply
-stablehlo.negate stablehlo.not stablehlo.or stablehlo.popcnt stablehlo.power stablehlo.remainder
+stablehlo.negate stablehlo.not stablehlo.or stablehlo.pad stablehlo.popcnt stablehlo.power stablehlo.remainder
 stablehlo.reshape stablehlo.reverse stablehlo.round_nearest_afz stablehlo.round_nearest_even stablehlo.rsqrt
 stablehlo.select stablehlo.shift_left stablehlo.shift_right_arithmetic stablehlo.shift_right_logical
 stablehlo.sign stablehlo.sine stablehlo.slice stablehlo.sqrt stablehlo.subtract stablehlo.tan stablehlo.tanh

@@ -80,6 +80,25 @@ def test_a_rollout_is_one_function_and_so_are_the_passes_of_its_derivative(optio
     assert lowered(jax.vmap(jax.value_and_grad(cost)), jnp.linspace(2.0, 3.0, 5)).count(WHOLE) == 2
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"derivative": "pathwise"},
+        {"derivative": "mean"},
+        {"clock": "continuous", "derivative": "pathwise"},
+        {"clock": "continuous", "switching": "located"},
+    ],
+    ids=["sampled", "mean", "per_step", "located"],
+)
+def test_the_passes_of_a_derivative_in_every_number_of_plant_and_law_are_one_function_each(options):
+    def cost(plant, law, theta):
+        return cpjax.measure(plant, law, near(theta), metrics=cpjax.TimeOutside(), duration=0.4, dt=0.01, **options)
+
+    numbers = jax.tree.map(jnp.asarray, (PLANT, CENTRED))
+    gradients = jax.vmap(jax.value_and_grad(cost, argnums=(0, 1)), (None, None, 0))
+    assert lowered(gradients, *numbers, jnp.linspace(2.0, 3.0, 5)).count(WHOLE) == 2
+
+
 def test_a_batch_too_large_for_one_core_stays_shared_out():
     starts = jnp.linspace(2.0, 3.0, single_kernel.LARGEST + 1)
     assert WHOLE not in lowered(jax.vmap(lambda theta: effort(near(theta), CENTRED)), starts)
@@ -145,7 +164,7 @@ def zoo(law, state):
     smooth += [jnp.cbrt(2.0 + jnp.sin(x)), jax.nn.sigmoid(v), jnp.arctan2(x, 1.0 + v * v), (2.0 + jnp.sin(x)) ** 1.7]
     steps = [jnp.floor(3.0 * x), jnp.ceil(v), jnp.round(theta), jnp.sign(omega), jnp.mod(theta, 2.0), jnp.abs(v)]
     steps += [jnp.clip(omega, -1.0, 1.0), jnp.where(jnp.isfinite(x), 1.0, 0.0), jnp.maximum(x, v) - jnp.minimum(x, v)]
-    table = jnp.concatenate([jnp.stack([x, v]), jnp.stack([x, theta, omega, v])])[::-1]
+    table = jnp.concatenate([jnp.stack([x, v]), jnp.pad(jnp.stack([theta, omega]), 1)])[::-1]
     taken = jax.lax.dynamic_slice(table, (jnp.int32(law.gain > 0) + 1,), (2,)).sum() + table.reshape(2, 3).T[1, 0]
     looped = jax.lax.fori_loop(0, 3, lambda _, y: 0.5 * y + x, v) + jax.lax.while_loop(
         lambda y: y > 1.0, lambda y: 0.5 * y, jnp.abs(theta)
