@@ -113,8 +113,8 @@ def main(out: Path, quick: bool = False, laps: int = 12) -> dict[str, Any]:
                     row = {"part": part, "configured": configured, "case": name, "gain": float(np.median(ratios))}
                     rows.append(row | {"quartiles": np.quantile(ratios, (0.25, 0.75)).tolist()})
                     print(f"{part}, {name}: {row['gain']:.2f}", file=sys.stderr)
-                without.process.kill()
-            whole.process.kill()
+                without.close()
+            whole.close()
         files.write_json(out / "ablation.json", {"versions": files.versions(), "rows": rows})
     for configured, names in CASES.items():
         gains = {(row["part"], row["case"]): row["gain"] for row in rows if row["configured"] == configured}
