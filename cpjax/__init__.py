@@ -30,7 +30,7 @@ from cpjax.controllers import (
     VoltageSignal,
     as_sampled,
 )
-from cpjax.errors import DerivativeWarning, InputError, PerformanceWarning
+from cpjax.errors import DamagedFileWarning, DerivativeWarning, InputError, PerformanceWarning
 from cpjax.io import load, save
 from cpjax.linear.discretization import discretize, discretize_cost
 from cpjax.linear.lqr import dlqr, lqr
@@ -60,6 +60,7 @@ __all__ = [
     "AngleGate",
     "AngleRateGate",
     "CartPole",
+    "DamagedFileWarning",
     "DerivativeWarning",
     "EnergySwingUp",
     "Flag",

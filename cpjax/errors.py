@@ -48,3 +48,7 @@ class DerivativeWarning(UserWarning):
 
 class PerformanceWarning(UserWarning):
     """A computation runs much slower than it could; the message gives the reason."""
+
+
+class DamagedFileWarning(UserWarning):
+    """A file of partial results cannot be read; the message says what it is called now, and that its work is redone."""

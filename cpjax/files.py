@@ -34,7 +34,7 @@ def read_table(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as problem:  # ValueError: not UTF-8, or a null byte in the path
         raise InputError("path", str(path), f"a readable text file ({problem})") from problem
     try:
-        table = tomllib.loads(text) if suffix == ".toml" else _numbers(json.loads(text, object_pairs_hook=_once))
+        table = tomllib.loads(text) if suffix == ".toml" else parse_json(text)
     except (ValueError, RecursionError) as problem:
         raise InputError("path", str(path), f"a valid {suffix[1:].upper()} file ({problem})") from problem
     if not isinstance(table, dict):
@@ -52,6 +52,11 @@ def dump_json(data: Any) -> str:
     text = json.dumps(_plain(data), indent=1, allow_nan=False)
     # Puts each list of numbers on one line. JSON strings hold no raw line breaks, so none of them changes.
     return re.sub(r"\[[^][{}]*\]", lambda match: re.sub(r"\n\s*", " ", match[0]), text) + "\n"
+
+
+def parse_json(text: str) -> Any:
+    """Returns the plain values of JSON that `dump_json` wrote; ValueError or RecursionError for other text."""
+    return _numbers(json.loads(text, object_pairs_hook=_once))
 
 
 def write_text(path: Path, text: str) -> None:

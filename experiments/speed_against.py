@@ -10,6 +10,7 @@ which leaves the compiler's options as they are.
 """
 
 import argparse
+import dataclasses
 import functools
 import json
 import os
@@ -22,9 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from cpjax import files
-from cpjax.cli.tables import print_table
 
 Cases = dict[str, tuple[Callable[[], Any], float, int]]
 """By name: what to call, its work (million steps, or calls), and how often a lap calls it."""
@@ -49,15 +47,26 @@ def cases(configured: bool = True) -> Cases:
     declared = getattr(cpjax, "Simulation", None)
     plain = common | ({"derivative": "pathwise"} if declared and "derivative" in declared.__annotations__ else {})
 
-    def outside(law: Any, start: Any, settings: dict[str, Any]) -> Any:
+    # Numbers and a vector: a derivative in one of them can miss what slows the others.
+    laws = {"swing_up": ("energy_gain", "cart_stiffness", "cart_damping"), "regulator": ("K",), "gate": ("rate",)}
+    numbers = {
+        part: {name: jnp.asarray(getattr(getattr(controller, part), name)) for name in names}
+        for part, names in laws.items()
+    }
+
+    def outside(numbers: Any, start: Any, settings: dict[str, Any]) -> Any:
+        parts = {part: dataclasses.replace(getattr(controller, part), **of) for part, of in numbers.items()}
+        law = dataclasses.replace(controller, **parts)
         return cpjax.measure(plant, law, start, metrics=cpjax.TimeOutside(), **settings)
 
     def batched(settings: dict[str, Any], differentiate: bool) -> Callable[..., Any]:
-        def one(law: Any, start: Any) -> Any:
-            return outside(law, start, settings)
+        def one(numbers: Any, start: Any) -> Any:
+            return outside(numbers, start, settings)
 
-        # In every number of the law: a derivative in one of them can miss what slows the others.
-        return jax.jit(jax.vmap(jax.value_and_grad(one) if differentiate else one, in_axes=(None, 0)))
+        def gradients(numbers: Any, starts: Any) -> Any:
+            return cpjax.gradients(one, numbers, starts)
+
+        return jax.jit(gradients if differentiate else jax.vmap(one, in_axes=(None, 0)))
 
     found: Cases = {}
     drawn = {count: cpjax.sample_starts("hanging", count, seed=1) for count in (4096, 65_536)}
@@ -66,7 +75,7 @@ def cases(configured: bool = True) -> Cases:
             starts = jax.tree.map(functools.partial(jnp.asarray, dtype=dtype), drawn[count])
             sweep = functools.partial(cpjax.sweep, plant, controller, starts, **common)
             found[f"sweep of {count}, {dtype.__name__}"] = sweep, count * 2e-3, 65_536 // count // 4 or 1
-    starts, law = cpjax.sample_starts("hanging", 64, seed=1), jax.tree.map(jnp.asarray, controller)
+    starts = cpjax.sample_starts("hanging", 64, seed=1)
     for name, settings, differentiate in (
         ("gradient of 64", plain, True),
         ("gradient of 64, every step kept", plain | {"checkpoint": "every_step"}, True),
@@ -74,10 +83,10 @@ def cases(configured: bool = True) -> Cases:
         ("located values of 64", located, False),
         ("located gradient of 64", located, True),
     ):
-        found[name] = functools.partial(batched(settings, differentiate), law, starts), 64 * 2e-3, 4
+        found[name] = functools.partial(batched(settings, differentiate), numbers, starts), 64 * 2e-3, 4
     start = cpjax.State(0.0, 0.0, np.pi - 0.01, 0.0)
-    measure = jax.jit(lambda law: outside(law, start, plain))
-    found["one measure under jit"] = lambda: measure(law), 1e-6, 100
+    measure = jax.jit(lambda numbers: outside(numbers, start, plain))
+    found["one measure under jit"] = lambda: measure(numbers), 1e-6, 100
     found["one measure"] = lambda: cpjax.measure(plant, controller, start, **common), 1e-6, 100
     found["one rollout"] = lambda: cpjax.rollout(plant, controller, start, **common).state.x, 1e-6, 100
     return found
@@ -140,6 +149,10 @@ class Child:
 
 def main(out: Path, quick: bool = False, against: str = "HEAD", laps: int = 20, case: str = "") -> dict[str, Any]:
     """Runs both commits in turn, prints the table and writes speed_against.json."""
+    # Not above: a child that takes its names from here has the older commit's package.
+    from cpjax import files
+    from cpjax.cli.tables import print_table
+
     here = Path(__file__).resolve().parents[1]
     rows = []
     with tempfile.TemporaryDirectory() as folder:

@@ -17,6 +17,7 @@ LAYERS = [
     "pytree",
     "checks",
     "files",
+    "archive",
     "workspace",
     "backend",
     "numeric",

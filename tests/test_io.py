@@ -34,7 +34,6 @@ from cpjax import (
     io,
     paper,
     rollout,
-    workspace,
 )
 from cpjax.controllers import SingleLaw, SmoothClip, SmoothHybrid
 from cpjax.sim.rollout import Trajectory
@@ -615,55 +614,3 @@ def test_a_relative_path_without_a_folder_is_written_here(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     io.save("plant.json", PLANT)
     assert [p.name for p in Path(tmp_path).iterdir()] == ["plant.json"]
-
-
-def test_parts_of_a_work_stay_when_it_is_stopped_and_are_refused_to_any_other(tmp_path):
-    folder = tmp_path / "parts"
-
-    def work(request, saved, stop=None):
-        with workspace.parts_of(folder, request) as parts:
-            found = sorted(path.name for path in parts.iterdir())
-            if saved:
-                (parts / saved).write_text("done")
-            if stop is not None:
-                raise stop
-        return found
-
-    with pytest.raises(KeyboardInterrupt):
-        work({"seed": 1}, None, KeyboardInterrupt())
-    assert not folder.exists()  # nothing was saved
-    with pytest.raises(ZeroDivisionError):
-        work({"seed": 1}, "first", ZeroDivisionError())
-    with pytest.raises(InputError, match=f"path = '{folder}': must be a place without the parts of other work"):
-        work({"seed": 2}, "second")
-    assert work({"seed": 1}, "second") == ["first", "request.json"]
-    assert not folder.exists()
-    assert work({"seed": 2}, "first") == ["request.json"]
-
-
-def test_a_claim_alone_in_its_folder_gives_way(tmp_path):
-    workspace.claim(tmp_path / "parts" / "request.json", {"seed": 1})
-    workspace.claim(tmp_path / "parts" / "request.json", {"seed": 2})
-    assert json.loads((tmp_path / "parts" / "request.json").read_text()) == {"seed": 2}
-
-
-def test_a_stopped_removal_leaves_nothing_that_a_claim_could_take_for_its_parts(tmp_path, monkeypatch):
-    folder = tmp_path / "parts"
-    workspace.claim(folder / "request.json", {"seed": 1})
-    (folder / "first").write_text("done")
-
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("shutil.rmtree", stop)
-        with pytest.raises(KeyboardInterrupt):
-            workspace.release(folder)
-    assert not folder.exists()
-
-
-def test_a_claim_at_an_impossible_place_is_bad_input(tmp_path):
-    (tmp_path / "file").write_text("")
-    for place in (tmp_path / "file" / "parts", tmp_path / ("o" * 300)):
-        with pytest.raises(InputError, match="a place that can be written"):
-            workspace.claim(place / "request.json", {})

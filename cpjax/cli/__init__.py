@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 from cpjax import startup
 from cpjax.cli import output
 from cpjax.cli.output import complain
-from cpjax.errors import InputError
+from cpjax.errors import DamagedFileWarning, InputError
 
 EXIT_CODES = """\
 exit codes:
@@ -129,6 +129,8 @@ def _run(arguments: list[str], set_up: bool) -> int:
         startup.ready()  # until here an interrupt ends the process at once: nothing has been written
         if not sys.warnoptions:  # those that matter are in the results, as a flag, or in an error
             warnings.simplefilter("ignore")
+            warnings.simplefilter("always", DamagedFileWarning)
+            warnings.showwarning = lambda message, *_, **__: complain(f"cpjax {options.command}: warning: {message}")
     # The protocol's figures are float64. Set here, in the application: the library never changes this setting.
     jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # JAX has no annotations for it
     try:

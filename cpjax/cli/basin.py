@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cpjax import files, io, workspace
+from cpjax import files, io
 from cpjax.cli.builders import PLANT_OPTIONS, build_plant, controller_title, named_hybrid
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, resolve
@@ -25,6 +25,7 @@ from cpjax.sim.metrics import Metrics
 from cpjax.study.basin import MOST_CELLS, Axis, StartGrid, area, document
 from cpjax.study.design_check import DesignCheck, check_design
 from cpjax.study.recording import read_sweep, record_sweep
+from cpjax.workspace import Workspace
 
 if TYPE_CHECKING:  # importing matplotlib is slow; bad input should fail before it
     from cpjax.show.basin import Panel
@@ -125,8 +126,8 @@ def drawn(
         "plant": io.encode(plant),
         "controllers": {name: io.encode(one) for name, one in controllers.items()},
     }
-    with workspace.parts_of(parts, request):
-        metrics = {name: mapped(parts, plant, chart, name, one, setting) for name, one in controllers.items()}
+    with Workspace(parts, request) as memory:
+        metrics = {name: mapped(memory, plant, chart, name, one, setting) for name, one in controllers.items()}
         rows = {name: document(chart, found) for name, found in metrics.items()}
 
         from cpjax.show.basin import basins
@@ -174,12 +175,13 @@ def file_of(name: str) -> str:
 
 
 def mapped(
-    parts: Path, plant: CartPole, chart: StartGrid, name: str, controller: Hybrid, setting: dict[str, Any]
+    memory: Workspace, plant: CartPole, chart: StartGrid, name: str, controller: Hybrid, setting: dict[str, Any]
 ) -> Metrics:
-    """Returns the metrics of a controller's map, recorded in `parts` or, if complete there, read from it."""
-    path = parts / file_of(name)
-    if path.exists():
-        columns: dict[str, Any] = read_sweep(path)[1]
+    """Returns the metrics of a controller's map, recorded in `memory` or, if complete there, read from it."""
+    path = memory.folder / file_of(name)
+    known = memory.intact(path, read_sweep)
+    if known is not None:
+        columns: dict[str, Any] = known[1]
         return Metrics(**{field.name: columns[field.name] for field in dataclasses.fields(Metrics)})
     with progress(name) as report:
         metrics: Metrics = record_sweep(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from cpjax import files, io, paper, workspace
+from cpjax import files, io, paper
 from cpjax.cli.builders import PLANT_OPTIONS, build_plant
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, resolve
@@ -20,6 +20,7 @@ from cpjax.paper.comparison import Compared, compare, entries
 from cpjax.paper.reproduction import DESIGNS, EvaluationConfig
 from cpjax.plant import CartPole
 from cpjax.study.fronts.config import COSTS, FrontConfig
+from cpjax.workspace import Workspace
 
 if TYPE_CHECKING:  # slow to import
     from cpjax.show.front import Curve
@@ -100,9 +101,9 @@ def made(
     from cpjax.study.fronts.reference_point import reference_points
 
     request = {"plan": dataclasses.asdict(plan), "plant": io.encode(plant), "supplies": supplies}
-    with workspace.parts_of(parts, {**request, "versions": files.versions()}):
+    with Workspace(parts, {**request, "versions": files.versions()}) as memory:
         measure = reference_points(plant, plan, supplies)
-        found = {design: traced(parts / design, plant, design, plan, supplies, measure) for design in DESIGNS}
+        found = {design: traced(memory, plant, design, plan, supplies, measure) for design in DESIGNS}
         known = known_controllers(plant, plan)
         document = {
             "what": "mean settling time against mean cost, of controllers that no other found beats",
@@ -134,17 +135,18 @@ def known_controllers(plant: CartPole, plan: FrontConfig) -> list[tuple[str, Com
 
 
 def traced(
-    folder: Path,
+    memory: Workspace,
     plant: CartPole,
     design: paper.Design,
     plan: FrontConfig,
     supplies: tuple[float, ...],
     measure: "ReferencePoints",
 ) -> dict[str, Any]:
-    """Traces a design's fronts, saved in `folder`, from where an interrupted run goes on; returns plain values."""
-    path = folder / "fronts.json"
-    if path.exists():
-        return files.read_table(path)
+    """Traces a design's fronts, saved in `memory`, from where an interrupted run goes on; returns plain values."""
+    known = memory.load(f"{design}-fronts")
+    if known is not None:
+        plain: dict[str, Any] = known[1]
+        return plain
 
     from cpjax.study.fronts.trace import trace_fronts  # imports optax, which is slow; other commands need none
 
@@ -156,7 +158,7 @@ def traced(
             measure.reference,
             supplies=supplies,
             report=compiling(report, "screening"),
-            memory=folder,
+            memory=memory,
         )
     rows = [
         {
@@ -179,7 +181,7 @@ def traced(
     ]
     steps = [{"supply": supply, **counted} for supply, counted in fronts.steps.items()]
     found = {"rows": rows, "steps": steps, "seconds": fronts.seconds}
-    files.write_json(path, found)
+    memory.save(f"{design}-fronts", {}, found)
     return found
 
 

@@ -5,7 +5,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from cpjax import __version__, files, paper, workspace
+from cpjax import __version__, files, paper
 from cpjax.cli.builders import EVALUATION_OPTIONS
 from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
@@ -13,6 +13,7 @@ from cpjax.cli.reproduce import print_rows, rows_of
 from cpjax.errors import InputError
 from cpjax.paper.reproduction import EvaluationConfig
 from cpjax.study.basin import MOST_CELLS
+from cpjax.workspace import Workspace
 
 OPTIONS = [
     *EVALUATION_OPTIONS,
@@ -47,8 +48,8 @@ def run(given: argparse.Namespace) -> int:
     per_axis, studies = chosen.get("cells", 192), chosen.get("studies", "quick")
     asked = {"setting": dataclasses.asdict(setting), "cells": per_axis, "studies": studies}
     asked["versions"] = files.versions()
-    with workspace.parts_of(given.out / "report.parts", asked) as parts:
-        rows = written(given, parts, setting, per_axis, studies)
+    with Workspace(given.out / "report.parts", asked) as memory:
+        rows = written(given, memory.folder, setting, per_axis, studies)
     print_rows(rows)
     say(f"wrote {given.out / 'report.html'}")
     return 0
@@ -65,7 +66,7 @@ def written(
       per_axis: cells of the basins along each axis; 0 for none.
       studies: none, quick or full.
     """
-    rows = rows_of(given, setting)
+    rows = rows_of(given.out, parts / "reproduction", setting)
 
     from cpjax.cli import report_sections as sections_of  # matplotlib is slow; bad input should fail before
     from cpjax.cli.compare import compared

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from cpjax.cli.builders import EVALUATION_OPTIONS
@@ -27,7 +28,7 @@ def add_command(commands: Any) -> None:
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     setting = setting_of(given)
-    rows = rows_of(given, setting)
+    rows = rows_of(given.out, given.out / "reproduction.parts", setting)
 
     from cpjax.show.figures import save_figure, success_rates
     from cpjax.show.reproduction import findings, pictures
@@ -47,10 +48,16 @@ def setting_of(given: argparse.Namespace) -> EvaluationConfig:
     return EvaluationConfig(seed=given.seed, **resolve(given, EVALUATION_OPTIONS)["evaluation"])
 
 
-def rows_of(given: argparse.Namespace, setting: EvaluationConfig) -> list[dict[str, Any]]:
-    """Runs the reproduction, shows its progress and saves each row in reproduction.json."""
+def rows_of(out: Path, parts: Path, setting: EvaluationConfig) -> list[dict[str, Any]]:
+    """Runs the reproduction, shows its progress, writes reproduction.json and returns its rows.
+
+    Args:
+      out: folder of the file.
+      parts: folder of finished rows, from which an interrupted run goes on; removed at the end.
+      setting: configuration of the evaluation.
+    """
     with progress("reproduce") as report:
-        return reproduce(setting, progress=report, path=given.out / "reproduction.json")
+        return reproduce(setting, progress=report, path=out / "reproduction.json", parts=parts)
 
 
 def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:

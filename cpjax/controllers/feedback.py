@@ -1,7 +1,8 @@
 """Linear state feedback and its two designs: linear quadratic regulator and pole placement."""
 
+import copy
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -116,3 +117,16 @@ class StateFeedback:
         """Returns the demanded voltage [V]."""
         s = deviation(state, self.reference)
         return -(self.K[0, 0] * s[0] + self.K[0, 1] * s[1] + self.K[0, 2] * s[2] + self.K[0, 3] * s[3])
+
+
+def without_design(controller: Any) -> Any:
+    """Returns a controller without the designs of its regulators: gains with and without one share a compilation."""
+
+    def bare(law: Any) -> Any:
+        if not isinstance(law, StateFeedback) or law.design is None:
+            return law
+        law = copy.copy(law)  # not `replace`, whose checks the gain has already passed
+        object.__setattr__(law, "design", None)
+        return law
+
+    return jax.tree.map(bare, controller, is_leaf=lambda part: isinstance(part, StateFeedback))

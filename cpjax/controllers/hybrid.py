@@ -1,13 +1,10 @@
 """Hybrid controller: a swing-up law outside a gate, a regulator inside it."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from cpjax.checks import call, real
-from cpjax.controllers.feedback import StateFeedback
 from cpjax.controllers.gates import AngleGate, AngleRateGate, Gate, LyapunovGate
 from cpjax.controllers.protocol import REGULATE, SWING_UP, Law, ModeMemory, start_memory, update_mode
 from cpjax.plant.state import State
@@ -72,11 +69,3 @@ class Hybrid:
 
     def _gate_margin(self, state: State, mode: jax.Array) -> jax.Array:
         return real("controller.gate.margin", call("controller.gate", self.gate, "margin", state, mode))
-
-
-def without_design(controller: Hybrid) -> Hybrid:
-    """Returns the controller without its regulator's design, so that hybrids of all designs share one compilation."""
-    regulator = controller.regulator
-    if isinstance(regulator, StateFeedback):
-        regulator = dataclasses.replace(regulator, design=None)
-    return dataclasses.replace(controller, regulator=regulator)

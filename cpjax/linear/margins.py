@@ -8,20 +8,31 @@ the plant has poles there:
     L real        where  Im T = 0;    a gain k puts a pole there if k = -1 / L = 1 - 1 / T
     |S - T| / 2   =      |T - 1/2|,   whose peak is 1 / (disk margin), S = 1 - T
 
-The frequencies at which this happens are zeros of functions of T(s) and T(-s), found as eigenvalues of a matrix (no
-grid could miss one), polished by Newton's method, and differentiated by the implicit function theorem.
+The frequencies at which this happens are found in `_crossovers.py`.
 """
 
 import math
-from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
+from cpjax.linear._crossovers import (
+    Crossovers,
+    Loop,
+    above_half,
+    epsilon,
+    excess,
+    excess_slope,
+    gain_candidates,
+    imaginary_part,
+    level_candidates,
+    phase_candidates,
+    root_near,
+    roots_near,
+    transfer,
+)
 from cpjax.linear.arguments import column, columns, gain_matrix, matrices, square
 
 
@@ -155,37 +166,20 @@ def _margins(A: jax.Array, B: jax.Array, K: jax.Array) -> Margins:
     # A stable replacement keeps numbers and derivatives finite where the result will be NaN.
     closed = jnp.where(stable, closed, -jnp.eye(A.shape[0], dtype=A.dtype))
     poles = jnp.where(stable, poles, -jnp.ones_like(poles))
-    loop = _Loop(closed, B, K)
+    loop = Loop(closed, B, K)
     scale = jnp.exp(jnp.mean(jnp.log(jnp.abs(poles))))
 
-    fixed = lax.stop_gradient(loop)  # only guesses; `_tied` differentiates their roots
-    lower, upper = _gain_margins(_crossovers(_imaginary_part, _phase_candidates(fixed, scale), loop, scale), loop)
-    crossovers = _crossovers(_above_half, _gain_candidates(fixed), loop, scale)
+    fixed = lax.stop_gradient(loop)  # only guesses; `tied` differentiates their roots
+    lower, upper = _gain_margins(roots_near(imaginary_part, phase_candidates(fixed, scale), loop, scale), loop)
+    crossovers = roots_near(above_half, gain_candidates(fixed), loop, scale)
     phase, delay = _phase_and_delay_margins(crossovers, loop)
-    excess, frequency = _peak(loop, scale, jnp.concatenate([jnp.abs(poles), jnp.abs(poles.imag), crossovers.frequency]))
-    root = jnp.sqrt(1.0 + 4.0 * excess)  # twice the peak of |T - 1/2|
-    bounded = excess > 0.0
-    disk_gain = jnp.where(bounded, (root + 1.0) ** 2 / (4.0 * jnp.where(bounded, excess, 1.0)), jnp.inf)
+    peak, frequency = _peak(loop, scale, jnp.concatenate([jnp.abs(poles), jnp.abs(poles.imag), crossovers.frequency]))
+    root = jnp.sqrt(1.0 + 4.0 * peak)  # twice the largest |T - 1/2|
+    bounded = peak > 0.0
+    disk_gain = jnp.where(bounded, (root + 1.0) ** 2 / (4.0 * jnp.where(bounded, peak, 1.0)), jnp.inf)
     found = (*lower, *upper, *phase, *delay, 2.0 / root, frequency, disk_gain, 2.0 * jnp.arctan(1.0 / root))
     return Margins(stable, *(jnp.where(stable, value, jnp.nan) for value in found))
 
-
-class _Loop(NamedTuple):
-    """Realisation of T(s) = K (sI - F)^-1 B, with F = A - B K."""
-
-    F: jax.Array
-    B: jax.Array
-    K: jax.Array
-
-
-class _Crossovers(NamedTuple):
-    """Frequencies [rad/s]; only those marked `valid` are crossovers."""
-
-    frequency: jax.Array
-    valid: jax.Array
-
-
-_OfFrequency: TypeAlias = Callable[[jax.Array, _Loop], jax.Array]
 
 _Margin: TypeAlias = tuple[jax.Array, jax.Array]
 """Value and frequency."""
@@ -210,137 +204,12 @@ def _resolvent(A: jax.Array, n: int) -> tuple[jax.Array, list[jax.Array]]:
     return jnp.stack(coefficients), adjugate[:-1]
 
 
-def _transfer(frequency: jax.Array, loop: _Loop) -> jax.Array:
-    """Computes T at s = i `frequency`."""
-    n = loop.F.shape[0]
-    resolvent = lax.complex(-loop.F, frequency * jnp.eye(n, dtype=loop.F.dtype))
-    states = jnp.linalg.solve(resolvent, lax.complex(loop.B, jnp.zeros_like(loop.B)))
-    return lax.complex(loop.K @ states.real, loop.K @ states.imag)
-
-
-def _above_half(frequency: jax.Array, loop: _Loop) -> jax.Array:
-    return _transfer(frequency, loop).real - 0.5
-
-
-def _imaginary_part(frequency: jax.Array, loop: _Loop) -> jax.Array:
-    return _transfer(frequency, loop).imag
-
-
-def _excess(frequency: jax.Array, loop: _Loop) -> jax.Array:
-    """Computes |T - 1/2|^2 - 1/4 without cancellation."""
-    T = _transfer(frequency, loop)
-    return T.real * T.real + T.imag * T.imag - T.real
-
-
-def _excess_slope(frequency: jax.Array, loop: _Loop) -> jax.Array:
-    return _with_slope(_excess, frequency, loop)[1]
-
-
-def _with_slope(function: _OfFrequency, frequency: jax.Array, loop: _Loop) -> tuple[jax.Array, jax.Array]:
-    """Returns value and derivative with respect to frequency."""
-    return jax.jvp(lambda w: function(w, loop), (frequency,), (jnp.ones_like(frequency),))
-
-
-def _gain_candidates(loop: _Loop) -> jax.Array:
-    """Returns candidates for zeros of T(s) + T(-s) - 1 on the imaginary axis."""
-    feedback = jnp.outer(loop.B, loop.K)
-    plant = loop.F + feedback
-    return _on_axis(jnp.linalg.eigvals(jnp.block([[plant, -feedback], [feedback, -plant]])))
-
-
-def _phase_candidates(loop: _Loop, scale: jax.Array) -> jax.Array:
-    """Returns candidates for zeros of T(s) - T(-s) on the imaginary axis.
-
-    It vanishes at infinity, so they come from the inverse of its system pencil at a shift.
-    """
-    n = loop.F.shape[0]
-    shift = 0.7390851332151607 * scale  # real; with this factor it is unlikely to be a zero itself
-    B, K = loop.B * (scale / _largest(loop.B)), loop.K * (scale / _largest(loop.K))
-    one, zero = shift * jnp.eye(n, dtype=scale.dtype), jnp.zeros_like(loop.F)
-    pencil = jnp.block(
-        [
-            [one - loop.F, zero, -B[:, None]],
-            [zero, one + loop.F, -B[:, None]],
-            [K[None, :], K[None, :], jnp.zeros((1, 1), dtype=scale.dtype)],
-        ]
-    )
-    inverse = jnp.linalg.solve(pencil, jnp.eye(2 * n + 1, 2 * n, dtype=scale.dtype))[: 2 * n]
-    return _on_axis(-1.0 / jnp.linalg.eigvals(inverse))  # the zeros minus the shift
-
-
-def _level_candidates(loop: _Loop, level: jax.Array) -> jax.Array:
-    """Returns candidates for axis zeros of T(s) T(-s) - (T(s) + T(-s)) / 2 - level, where `_excess` is the level."""
-    feedback = jnp.outer(loop.B, loop.K) / level
-    half, lower = 0.5 * feedback, (level + 0.25) * feedback
-    return _on_axis(jnp.linalg.eigvals(jnp.block([[loop.F - half, -feedback], [lower, half - loop.F]])))
-
-
-def _on_axis(zeros: jax.Array) -> jax.Array:
-    """Returns candidate frequencies (n,), ascending and padded with 0, from zeros (2n,) in conjugate pairs.
-
-    No zero is rejected for its real part, which is subject to rounding: a superfluous candidate does no harm.
-    """
-    usable = jnp.isfinite(zeros.imag) & (zeros.imag > 0.0)
-    return jnp.sort(jnp.where(usable, zeros.imag, 0.0))[zeros.shape[0] // 2 :]
-
-
-def _largest(vector: jax.Array) -> jax.Array:
-    largest = jnp.max(jnp.abs(vector))
-    return jnp.where(largest > 0.0, largest, 1.0)
-
-
-def _epsilon(array: jax.Array) -> float:
-    return float(np.finfo(array.dtype).eps)
-
-
-def _crossovers(condition: _OfFrequency, guesses: jax.Array, loop: _Loop, scale: jax.Array) -> _Crossovers:
-    """Returns the root of `condition` near each guess, with its derivative with respect to the loop."""
-    return jax.vmap(partial(_root, condition), in_axes=(0, None, None))(guesses, loop, scale)
-
-
-def _root(condition: _OfFrequency, guess: jax.Array, loop: _Loop, scale: jax.Array) -> _Crossovers:
-    """Returns the positive root of `condition` near a guess, marked valid where Newton's steps have become short.
-
-    Without a root on the axis they do not: for a zero at a distance d from the axis they stay longer than d.
-    """
-    fixed = lax.stop_gradient(loop)  # the iteration is not differentiated; `_tied` differentiates the equation
-
-    def newton(_: Any, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        frequency, _ = carry
-        value, slope = _with_slope(condition, frequency, fixed)
-        step = jnp.where(value == 0.0, 0.0, value / slope)
-        return jnp.abs(frequency - jnp.clip(step, -frequency, frequency)), jnp.abs(step)
-
-    start = jnp.where(guess > 0.0, guess, scale)
-    frequency, step = lax.fori_loop(0, 5, newton, (start, start))
-    valid = (guess > 0.0) & (frequency > 0.0) & (step <= _epsilon(guess) ** (1 / 3) * frequency)
-    frequency = _tied(condition, jnp.where(valid, frequency, scale), loop)
-    return _Crossovers(jnp.where(valid, frequency, scale), valid)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _tied(condition: _OfFrequency, frequency: jax.Array, loop: _Loop) -> jax.Array:
-    """Returns `frequency`, a root of `condition`, with its derivative with respect to the loop."""
-    return frequency
-
-
-@_tied.defjvp
-def _tied_jvp(
-    condition: _OfFrequency, primals: tuple[jax.Array, _Loop], tangents: tuple[jax.Array, _Loop]
-) -> tuple[jax.Array, jax.Array]:
-    frequency, loop = primals
-    frequency = _tied(condition, frequency, loop)
-    _, slope = _with_slope(condition, frequency, loop)
-    _, change = jax.jvp(lambda moved: condition(frequency, moved), (loop,), (tangents[1],))
-    return frequency, -change / jnp.where(slope == 0.0, jnp.inf, slope)
-
-
-def _gain_margins(crossovers: _Crossovers, loop: _Loop) -> tuple[_Margin, _Margin]:
+def _gain_margins(crossovers: Crossovers, loop: Loop) -> tuple[_Margin, _Margin]:
     """Returns the lower and the upper gain margin, from all real values of T; that at frequency 0 is always one."""
     frequency = jnp.pad(crossovers.frequency, (1, 0))
     valid = jnp.pad(crossovers.valid, (1, 0), constant_values=True)
-    T = jax.vmap(_transfer, in_axes=(0, None))(frequency, loop).real
-    tolerance = math.sqrt(_epsilon(T))
+    T = jax.vmap(transfer, in_axes=(0, None))(frequency, loop).real
+    tolerance = math.sqrt(epsilon(T))
     below, above = valid & (T * (1.0 - tolerance) > 1.0), valid & (T + tolerance < 0.0)
     factor = 1.0 - 1.0 / jnp.where(below | above, T, 1.0)
     lower = _pick(jnp.argmax(jnp.where(below, T, -jnp.inf)), below, factor, frequency, 0.0)
@@ -348,9 +217,9 @@ def _gain_margins(crossovers: _Crossovers, loop: _Loop) -> tuple[_Margin, _Margi
     return lower, upper
 
 
-def _phase_and_delay_margins(crossovers: _Crossovers, loop: _Loop) -> tuple[_Margin, _Margin]:
+def _phase_and_delay_margins(crossovers: Crossovers, loop: Loop) -> tuple[_Margin, _Margin]:
     frequency, valid = crossovers
-    y = jax.vmap(_transfer, in_axes=(0, None))(frequency, loop).imag
+    y = jax.vmap(transfer, in_axes=(0, None))(frequency, loop).imag
     phase = 2.0 * jnp.arctan2(jnp.full_like(y, 0.5), jnp.abs(y))  # pi - |arg L|
     delay = (math.pi + 2.0 * jnp.arctan(2.0 * y)) / frequency  # a delay only lags: (pi + arg L) / frequency
 
@@ -373,18 +242,18 @@ class _Ascent(NamedTuple):
     rounds: jax.Array
 
 
-def _peak(loop: _Loop, scale: jax.Array, frequencies: jax.Array) -> _Margin:
-    """Returns the maximum of `_excess` and its frequency; 0 and inf where it is not positive.
+def _peak(loop: Loop, scale: jax.Array, frequencies: jax.Array) -> _Margin:
+    """Returns the maximum of `excess` and its frequency; 0 and inf where it is not positive.
 
     Method: level by level after Bruinsma and Steinbuch (1990). The axis candidates of a level bound the intervals that
     rise above it, and the highest value at the middles of these intervals is the next level. It finds a peak of any
     width.
     """
     fixed = lax.stop_gradient(loop)  # not differentiated: at a maximum the frequency's derivative does not count
-    tolerance = math.sqrt(_epsilon(scale))
+    tolerance = math.sqrt(epsilon(scale))
 
     def higher(ascent: _Ascent, frequencies: jax.Array) -> _Ascent:
-        found = jax.vmap(_excess, in_axes=(0, None))(frequencies, fixed)
+        found = jax.vmap(excess, in_axes=(0, None))(frequencies, fixed)
         top = jnp.argmax(found)
         level, frequency = lax.cond(
             found[top] > ascent.level,
@@ -394,7 +263,7 @@ def _peak(loop: _Loop, scale: jax.Array, frequencies: jax.Array) -> _Margin:
         return _Ascent(level, frequency, level > (1.0 + tolerance) * ascent.level, ascent.rounds + 1)
 
     def rise(ascent: _Ascent) -> _Ascent:
-        edges = _level_candidates(fixed, ascent.level)
+        edges = level_candidates(fixed, ascent.level)
         below = jnp.pad(edges[:-1], (1, 0))
         # Both means, because the edges may be decades apart, or one of them a 0 displaced by rounding.
         return higher(ascent, jnp.concatenate([0.5 * (below + edges), jnp.sqrt(below * edges)]))
@@ -406,8 +275,8 @@ def _peak(loop: _Loop, scale: jax.Array, frequencies: jax.Array) -> _Margin:
     ascent = lax.while_loop(lambda ascent: ascent.rising & (ascent.rounds < 30), rise, ascent)
 
     bounded = jnp.isfinite(ascent.frequency)
-    polished, valid = _root(_excess_slope, jnp.where(bounded, ascent.frequency, 0.0), loop, scale)
+    polished, valid = root_near(excess_slope, jnp.where(bounded, ascent.frequency, 0.0), loop, scale)
     # Newton's method may have gone to another stationary point.
-    same = valid & (_excess(polished, fixed) > 0.999 * ascent.level)
+    same = valid & (excess(polished, fixed) > 0.999 * ascent.level)
     frequency = jnp.where(same, polished, ascent.frequency)
-    return jnp.where(bounded, _excess(jnp.where(bounded, frequency, scale), loop), 0.0), frequency
+    return jnp.where(bounded, excess(jnp.where(bounded, frequency, scale), loop), 0.0), frequency

@@ -8,7 +8,6 @@ import numpy as np
 
 from cpjax import files, io, paper
 from cpjax.controllers import Hybrid
-from cpjax.controllers.hybrid import without_design
 from cpjax.paper.reproduction import DESIGNS, GAINS, EvaluationConfig
 from cpjax.plant import CartPole
 from cpjax.plant.initial_states import sample_starts
@@ -90,7 +89,7 @@ def compare(
             progress(i, len(chosen), f"{entry.name}, {entry.design}, {entry.gains}")
         metrics: Metrics = sweep(
             plant,
-            without_design(entry.controller),
+            entry.controller,
             starts,
             duration=setting.duration,
             dt=setting.dt,

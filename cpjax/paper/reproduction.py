@@ -10,8 +10,6 @@ import jax
 import numpy as np
 
 from cpjax import files, paper
-from cpjax.controllers.hybrid import without_design
-from cpjax.errors import InputError
 from cpjax.plant.initial_states import check_starts, sample_starts
 from cpjax.plant.state import HANGING, State
 from cpjax.sim.metrics import Metrics
@@ -19,6 +17,7 @@ from cpjax.sim.rollout import Trajectory, rollout
 from cpjax.sim.settings import check_settings
 from cpjax.sim.sweep import sweep
 from cpjax.study.summary import summarise
+from cpjax.workspace import Workspace
 
 DESIGNS: tuple[paper.Design, ...] = ("placement", "lqr")
 GAINS: tuple[paper.Gains, ...] = ("printed", "computed")
@@ -68,39 +67,61 @@ def variants() -> list[Variant]:
 def evaluate(variant: Variant, setting: EvaluationConfig, starts: State | None = None) -> Metrics:
     """Returns the metrics (n,) of one variant from the initial states `starts` (n,), by default the setting's."""
     plant = paper.PLANTS[variant.plant]()
-    controller = without_design(paper.controller(variant.law, variant.design, plant, variant.gains))
+    controller = paper.controller(variant.law, variant.design, plant, variant.gains)
     if starts is None:
         starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
-    metrics: Metrics = sweep(
-        plant, without_design(controller), starts, duration=setting.duration, dt=setting.dt, clock="sampled"
-    )
+    metrics: Metrics = sweep(plant, controller, starts, duration=setting.duration, dt=setting.dt, clock="sampled")
     return metrics
 
 
 def reproduce(
-    setting: EvaluationConfig, *, progress: Callable[[int, int, str], None] | None = None, path: Path | None = None
+    setting: EvaluationConfig,
+    *,
+    progress: Callable[[int, int, str], None] | None = None,
+    path: Path | None = None,
+    parts: Path | None = None,
 ) -> list[dict[str, Any]]:
     """Returns one row per variant: its names, and the result of `summarise` for its metrics.
 
     Args:
       setting: configuration of the evaluation.
       progress: called with the rows done, their number, and the next row in words.
-      path: JSON file in which the rows are saved after each of them; a file of anything else is overwritten. Rows of an
-        interrupted run with the same setting and versions are not computed again; after changing the code, choose
-        another path.
+      path: JSON file to write the rows to, if any.
+      parts: with `path`, the folder in which each row is saved when it is done, by default `path` with ".parts" at its
+        end. A run with the same setting and versions that was interrupted resumes there; the folder is removed at the
+        end.
 
     Raises:
-      InputError: a `path` that cannot be written.
+      InputError: a `path` that cannot be written, or `parts` of another computation.
     """
+    if path is None:
+        return _rows(setting, progress, None)
+    what = {
+        "what": "the paper's controllers over a seeded set of starts",
+        "versions": files.versions(),
+        "setting": dataclasses.asdict(setting),
+    }
+    with Workspace(parts or path.with_name(path.name + ".parts"), what) as memory:
+        rows = _rows(setting, progress, memory)
+        files.write_json(path, {**what, "complete": True, "rows": rows})
+    return rows
+
+
+def _rows(
+    setting: EvaluationConfig, progress: Callable[[int, int, str], None] | None, memory: Workspace | None
+) -> list[dict[str, Any]]:
     starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
     todo = variants()
-    rows = _resume(path, setting) if path is not None else []
-    for variant in todo[len(rows) :]:
-        if progress is not None:
-            progress(len(rows), len(todo), f"{variant.law}, {variant.plant}, {variant.design}, {variant.gains}")
-        rows.append({**dataclasses.asdict(variant), **summarise(evaluate(variant, setting, starts))})
-        if path is not None:
-            files.write_json(path, _document(setting, rows))
+    rows = []
+    for number, variant in enumerate(todo):
+        known = None if memory is None else memory.load(f"row-{number:02d}")
+        if known is None:
+            if progress is not None:
+                progress(number, len(todo), f"{variant.law}, {variant.plant}, {variant.design}, {variant.gains}")
+            known = {}, {**dataclasses.asdict(variant), **summarise(evaluate(variant, setting, starts))}
+            if memory is not None:
+                memory.save(f"row-{number:02d}", *known)
+        rows.append(known[1])
     if progress is not None:
         progress(len(todo), len(todo), "done")
     return rows
@@ -143,34 +164,6 @@ def trajectory(law: str, design: paper.Design, plant: str, start: State, setting
     model = paper.PLANTS[plant]()
     controller = paper.controller(law, design, model)
     return rollout(model, controller, start, duration=setting.duration, dt=setting.dt, clock="sampled")
-
-
-def _document(setting: EvaluationConfig, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    return {
-        "what": "the paper's controllers over a seeded set of starts",
-        "versions": files.versions(),
-        "setting": dataclasses.asdict(setting),
-        "complete": len(rows) == len(variants()),
-        "rows": rows,
-    }
-
-
-def _resume(path: Path, setting: EvaluationConfig) -> list[dict[str, Any]]:
-    """Returns the rows of an interrupted run with the same setting and versions, or none."""
-    if not path.exists():
-        return []
-    try:
-        document = files.read_table(path)
-    except InputError:
-        return []  # another kind of file, or broken: the first row overwrites it
-    expected = _document(setting, [])
-    same = all(document.get(key) == expected[key] for key in ("what", "versions", "setting"))
-    rows = document.get("rows")
-    if not same or document.get("complete", True) or not isinstance(rows, list) or len(rows) > len(variants()):
-        return []
-    expected_names = [dataclasses.asdict(variant) for variant in variants()[: len(rows)]]
-    found = [{key: dict(row).get(key) for key in names} for row, names in zip(rows, expected_names, strict=True)]
-    return rows if found == expected_names else []
 
 
 Setting = EvaluationConfig

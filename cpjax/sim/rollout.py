@@ -4,14 +4,13 @@ Everything here is for one initial state; batches are `jax.vmap` of it, as in `c
 computation: that of `per_step.py` or that of `located.py`.
 """
 
-import copy
 import functools
 from typing import Any, Unpack
 
 import jax
 import numpy as np
 
-from cpjax.controllers.feedback import StateFeedback
+from cpjax.controllers.feedback import without_design
 from cpjax.controllers.protocol import (
     Controller,
     Law,
@@ -139,7 +138,7 @@ def prepared(
     settings = check_settings(**simulation, events=has_events(plant))
     name = "starts" if batched else "start"
     start, dtype, count = checked_initial(plant, start, name, batched=batched)
-    controller = _without_designs(as_controller(controller))
+    controller = without_design(as_controller(controller))
     if settings.clock == "continuous" and not isinstance(controller, ModalController):
         allowed = "sampled: a controller with memory is updated once per control period"
         raise InputError("clock", settings.clock, allowed)
@@ -199,17 +198,3 @@ def results(kept: SavedSamples | None, last: Sample, result: Any) -> Any:
     if kept is None:
         return result
     return Trajectory(**fields(kept, last), flag=last.flag & ~NEEDS_RECOMPUTE, metrics=result)
-
-
-def _without_designs(controller: Any) -> Any:
-    """Returns the controller without its regulators' designs: gains with and without one share a compilation."""
-
-    def bare(law: Any) -> Any:
-        designed = isinstance(law, StateFeedback) and law.design is not None
-        if not designed:
-            return law
-        law = copy.copy(law)  # not `replace`, whose checks the law has already passed
-        object.__setattr__(law, "design", None)
-        return law
-
-    return jax.tree.map(bare, controller, is_leaf=lambda part: isinstance(part, StateFeedback))

@@ -2,7 +2,6 @@
 
 import hashlib
 import io as buffers
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from cpjax import files, io, workspace
+from cpjax import archive, files, io
 from cpjax.controllers.protocol import Controller, Law, ModalController, as_controller
 from cpjax.errors import InputError
 from cpjax.sim.metrics import Fold
@@ -20,11 +19,13 @@ from cpjax.sim.plants import Plant
 from cpjax.sim.rollout import default_metrics
 from cpjax.sim.settings import Simulation, check_names
 from cpjax.sim.sweep import Progress, SweepPlan, prepare
+from cpjax.workspace import Workspace
 
 SUFFIXES = (".parquet", ".npz", ".json")
 """Suffixes of the files that a sweep's metrics can be written to."""
 
-_DOCUMENT = "cpjax"  # key of the document in an NPZ or Parquet file
+_DOCUMENT = b"cpjax"  # key of the document in a Parquet file
+_DIGEST = "digest"  # key of the checksum in a document on disk
 
 
 def record_sweep(
@@ -79,27 +80,43 @@ def record_sweep(
         "metrics": _described(default_metrics(plant) if metrics is None else metrics),
     }
     folder = path if save_every else path.with_name(path.name + ".parts")
-    first = jax.process_index() == 0
-    parts = [
-        folder / f"part-{begin:09d}-{min(begin + work.size, work.total):09d}.npz" for begin in work.block_offsets()
-    ]
-    if first:
-        workspace.claim(folder / "sweep.json", {**document, "starts": _digest(work)})
-    done = np.array([part.exists() for part in parts])
+    if jax.process_index():
+        _record(None, work, progress)
+        return None
+    request = {**document, "starts": _fingerprint(work)}
+    with Workspace(folder, request, record="sweep.json", keep=save_every is not None) as parts:
+        blocks = _record(parts, work, progress, with_starts=save_every is not None)
+        return None if save_every else _assemble(path, blocks, document, work)
+
+
+def _record(
+    parts: Workspace | None, work: SweepPlan, progress: Progress | None, *, with_starts: bool = False
+) -> list[archive.Arrays]:
+    """Runs the blocks that are not in `parts` yet and saves them there; returns all of them, without trajectories.
+
+    All processes call this, the first with `parts`.
+    """
+    names = {begin: f"part-{begin:09d}-{min(begin + work.size, work.total):09d}" for begin in work.block_offsets()}
+    blocks: dict[int, archive.Arrays] = {}
+    there = np.zeros(len(names), bool)
+    for number, (begin, name) in enumerate(names.items()):
+        found = None if parts is None else parts.load(name)
+        if found is not None:
+            there[number] = True
+            blocks[begin] = {} if with_starts else found[0]
     if jax.process_count() > 1:
-        done = np.asarray(multihost_utils.broadcast_one_to_all(done))
-    computed = work.blocks(begin for begin, there in zip(work.block_offsets(), done, strict=True) if not there)
-    for begin, part, there in zip(work.block_offsets(), parts, done, strict=True):
-        if not there:
+        there = np.asarray(multihost_utils.broadcast_one_to_all(there))
+    computed = work.blocks(begin for begin, known in zip(names, there, strict=True) if not known)
+    for known, (begin, name) in zip(there, names.items(), strict=True):
+        if not known:
             columns = _columns(next(computed))
-            if first:
-                own = _starts(work, begin, begin + work.size) if save_every else {}
-                files.write_bytes(part, _npz({**own, **columns}))
+            if parts is not None:
+                own = _starts(work, begin, begin + work.size) if with_starts else {}
+                parts.save(name, {**own, **columns})
+                blocks[begin] = {} if with_starts else columns
         if progress is not None:
             progress(min(begin + work.size, work.total), work.total)
-    if save_every or not first:
-        return None
-    return _assemble(path, folder, parts, document, work)
+    return [blocks[begin] for begin in names] if parts is not None else []
 
 
 def read_sweep(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -109,24 +126,37 @@ def read_sweep(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]
       The document, and the columns (n, ...) by name: initial states ("start." and the component) and metrics.
 
     Raises:
-      InputError: no such file, or not one of `record_sweep`'s.
+      InputError: no such file, not one of `record_sweep`'s, or one whose content has changed since.
     """
     path = _checked_path(path, trajectories=False)
+    if path.suffix == ".npz":
+        columns, document = archive.read_archive(path)
+        return document, columns
     try:
         if path.suffix == ".json":
             table = files.read_table(path)
-            return table["document"], {name: np.asarray(values) for name, values in table["columns"].items()}
-        if path.suffix == ".npz":
-            with np.load(path) as archive:
-                columns = dict(archive)
-            return json.loads(str(columns.pop(_DOCUMENT))), columns
-        table = _pyarrow().parquet.read_table(path)
-        columns = {name: table[name].combine_chunks().to_numpy(zero_copy_only=False) for name in table.column_names}
-        return json.loads(table.schema.metadata[_DOCUMENT.encode()]), columns
-    except (OSError, ValueError, KeyError, TypeError, EOFError) as problem:
+            document, found = dict(table["document"]), files.dump_json(table["columns"])
+            columns = {name: np.asarray(values) for name, values in table["columns"].items()}
+            expected, actual = document.pop(_DIGEST, None), hashlib.sha256(found.encode()).hexdigest()
+        else:
+            table = _pyarrow().parquet.read_table(path, page_checksum_verification=True)
+            document = files.parse_json(table.schema.metadata[_DOCUMENT].decode())
+            columns = {name: _column(table[name]) for name in table.column_names}
+            expected, actual = document.pop(_DIGEST, None), archive.digest(columns)
+        # Files of cpjax 0.1 have no checksum.
+        if expected not in (None, actual):
+            raise ValueError("its content was changed")
+    except Exception as problem:  # pyarrow raises nearly anything for a damaged file
         if isinstance(problem, InputError):
             raise
         raise InputError("path", str(path), f"a file written by record_sweep ({problem})") from problem
+    return document, columns
+
+
+def _column(column: Any) -> np.ndarray[Any, Any]:
+    """Returns a column of a Parquet table (n,) or, of lists, (n, ...)."""
+    values = column.combine_chunks().to_numpy(zero_copy_only=False)
+    return np.stack([np.asarray(row.tolist()) for row in values]) if values.dtype == object else values
 
 
 def _checked_path(path: Any, *, trajectories: bool) -> Path:
@@ -158,16 +188,12 @@ def _described(component: Any) -> Any:
         return type(component).__name__
 
 
-def _digest(work: SweepPlan) -> str:
+def _fingerprint(work: SweepPlan) -> str:
     """Returns a fingerprint of all inputs of the sweep."""
-    digest = hashlib.sha256()
     # With classes, choices and functions; without addresses, which differ between processes.
-    digest.update(re.sub(r" at 0x[0-9a-f]+", "", str(work.kind.structure)).encode())
-    for leaf in work.leaves:
-        array = np.ascontiguousarray(leaf)
-        digest.update(f"{array.shape} {array.dtype}".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
+    structure = re.sub(r" at 0x[0-9a-f]+", "", str(work.kind.structure))
+    leaves = archive.digest({f"{number:06d}": leaf for number, leaf in enumerate(work.leaves)})
+    return hashlib.sha256(f"{structure} {leaves}".encode()).hexdigest()
 
 
 def _starts(work: SweepPlan, begin: int, end: int) -> dict[str, np.ndarray]:
@@ -183,30 +209,21 @@ def _columns(result: Any) -> dict[str, np.ndarray]:
     return columns
 
 
-def _npz(columns: Mapping[str, Any]) -> bytes:
-    buffer = buffers.BytesIO()
-    np.savez(buffer, **columns)
-    return buffer.getvalue()
-
-
-def _assemble(path: Path, folder: Path, parts: list[Path], document: dict[str, Any], work: SweepPlan) -> Any:
-    """Writes one file of all parts, deletes them, and returns the results."""
-    loaded = []
-    for part in parts:
-        with np.load(part) as archive:
-            loaded.append(dict(archive))
-    results = {name: np.concatenate([one[name] for one in loaded]) for name in loaded[0]}
+def _assemble(path: Path, blocks: list[archive.Arrays], document: dict[str, Any], work: SweepPlan) -> Any:
+    """Writes one file of all blocks and returns the results."""
+    results = {name: np.concatenate([one[name] for one in blocks]) for name in blocks[0]}
     columns = {**_starts(work, 0, work.total), **results}
     if path.suffix == ".json":
-        files.write_json(path, {"document": document, "columns": columns})
+        digest = hashlib.sha256(files.dump_json(columns).encode()).hexdigest()
+        files.write_json(path, {"document": {**document, _DIGEST: digest}, "columns": columns})
     elif path.suffix == ".npz":
-        files.write_bytes(path, _npz({_DOCUMENT: np.asarray(files.dump_json(document)), **columns}))
+        archive.write_archive(path, columns, document)
     else:
         arrow = _pyarrow()
         table = arrow.table({name: column if column.ndim == 1 else column.tolist() for name, column in columns.items()})
-        table = table.replace_schema_metadata({_DOCUMENT: files.dump_json(document)})
+        digest = archive.digest({name: _column(table[name]) for name in columns})
+        table = table.replace_schema_metadata({_DOCUMENT: files.dump_json({**document, _DIGEST: digest})})
         buffer = buffers.BytesIO()
-        arrow.parquet.write_table(table, buffer)
+        arrow.parquet.write_table(table, buffer, write_page_checksum=True)
         files.write_bytes(path, buffer.getvalue())
-    workspace.release(folder)
     return jax.tree.unflatten(work.structure(), list(results.values()))

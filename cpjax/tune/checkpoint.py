@@ -1,10 +1,5 @@
 """State of a tuning and its checkpoint file, from which a tuning interrupted at any moment resumes."""
 
-import hashlib
-import io as buffers
-import json
-import zipfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from cpjax import files
+from cpjax import workspace
+from cpjax.archive import read_archive, write_archive
 from cpjax.errors import InputError
 
 Numbers = np.ndarray[Any, Any]
@@ -51,15 +47,13 @@ def store(path: Path | None, identity: str, memory: TunerState) -> None:
     arrays = {f"optimiser_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
     arrays |= {name: getattr(memory, name) for name in ("vectors", "best", "scores")}
     counts = {name: getattr(memory, name) for name in ("step", "stale", "value_steps", "gradient_steps")}
-    note = json.dumps({"identity": identity, "history": memory.history, **counts, "digest": _digest(arrays)})
-    buffer = buffers.BytesIO()
-    arrays["note"] = np.frombuffer(note.encode(), dtype=np.uint8)
-    np.savez(buffer, allow_pickle=False, **arrays)
-    files.write_bytes(path, buffer.getvalue())
+    write_archive(path, arrays, {"identity": identity, "history": memory.history, **counts})
 
 
 def restore(path: Path | None, identity: str, optimiser: optax.GradientTransformation) -> TunerState | None:
-    """Returns the state that `store` wrote, or None without a path or a file.
+    """Returns the state that `store` wrote, or None without a path or a file, or if the file is damaged.
+
+    A damaged file is renamed, with a `DamagedFileWarning`.
 
     Args:
       path: the checkpoint file, or None.
@@ -67,34 +61,25 @@ def restore(path: Path | None, identity: str, optimiser: optax.GradientTransform
       optimiser: the tuning's optimiser, which gives the structure of its state.
 
     Raises:
-      InputError: a file that `store` did not write, or one of another tuning.
+      InputError: the file of another tuning.
     """
-    if path is None or not path.exists():
+
+    def read(path: Path) -> tuple[str, TunerState]:
+        arrays, note = read_archive(path)
+        try:
+            its_own = note.pop("identity")
+            blank = optimiser.init(jnp.asarray(arrays["vectors"]))
+            leaves = [jnp.asarray(arrays[f"optimiser_{i}"]) for i in range(len(jax.tree.leaves(blank)))]
+            state = jax.tree.unflatten(jax.tree.structure(blank), leaves)
+            vectors: dict[str, Any] = {name: arrays[name] for name in ("vectors", "best", "scores")}
+            return its_own, TunerState(optimiser=state, **vectors, **note)
+        except (KeyError, TypeError, AttributeError) as problem:
+            raise InputError("checkpoint", str(path), f"a file written by a tuning ({problem})") from problem
+
+    found = None if path is None else workspace.intact(path, read)
+    if found is None:
         return None
-    try:
-        with path.open("rb") as file, np.load(file) as content:
-            arrays = {name: content[name] for name in content.files}
-        note = json.loads(arrays.pop("note").tobytes())
-        if note.pop("digest") != _digest(arrays):
-            raise ValueError("its content was changed")
-        its_own = note.pop("identity")
-        blank = optimiser.init(jnp.asarray(arrays["vectors"]))
-        leaves = [jnp.asarray(arrays[f"optimiser_{i}"]) for i in range(len(jax.tree.leaves(blank)))]
-        state = jax.tree.unflatten(jax.tree.structure(blank), leaves)
-        found = TunerState(optimiser=state, **{name: arrays[name] for name in ("vectors", "best", "scores")}, **note)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as problem:
-        raise InputError("checkpoint", str(path), f"a file written by a tuning, or none ({problem})") from problem
-    if its_own != identity:
+    if found[0] != identity:
         allowed = "one of the same tuning (plan, plant, controller, versions); remove it, or choose another folder"
         raise InputError("checkpoint", str(path), allowed)
-    return found
-
-
-def _digest(arrays: Mapping[str, Any]) -> str:
-    """Returns a checksum of arrays with their names, shapes and dtypes."""
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name} {array.shape} {array.dtype.str} ".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
+    return found[1]

@@ -90,7 +90,7 @@ def test_a_rollout_is_one_function_and_so_are_the_passes_of_its_derivative(optio
     ],
     ids=["sampled", "mean", "per_step", "located"],
 )
-def test_the_passes_of_a_derivative_in_every_number_of_plant_and_law_are_one_function_each(options):
+def test_each_pass_of_a_derivative_in_all_numbers_is_one_function(options):
     def cost(plant, law, theta):
         return cpjax.measure(plant, law, near(theta), metrics=cpjax.TimeOutside(), duration=0.4, dt=0.01, **options)
 

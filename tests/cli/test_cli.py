@@ -23,6 +23,7 @@ from cpjax import (
     CartPole,
     EnergySwingUp,
     Hybrid,
+    InputError,
     LyapunovGate,
     Metrics,
     Motor,
@@ -658,9 +659,8 @@ def test_an_interrupted_reproduction_resumes_and_ends_with_identical_rows(
     first = command("reproduce", "--out", tmp_path, *EVALUATION)
     assert first.code == 130
     assert first.err.splitlines()[-1] == "cpjax reproduce: interrupted; what was saved so far is kept"
-    table = document(tmp_path, "reproduction.json")
-    assert (table["complete"], len(table["rows"])) == (False, 29)
-    assert {p.name for p in tmp_path.iterdir()} == {"reproduction.json"}
+    assert {p.name for p in tmp_path.iterdir()} == {"reproduction.parts"}
+    assert len([*(tmp_path / "reproduction.parts").glob("row-*.npz")]) == 29
 
     resumed = []
     monkeypatch.setattr(reproduction, "evaluate", lambda *arguments: resumed.append(arguments) or evaluate(*arguments))
@@ -674,7 +674,7 @@ def test_an_interrupted_reproduction_resumes_and_ends_with_identical_rows(
 
 @pytest.fixture
 def partial(tmp_path, monkeypatch):
-    """The file of a run that was interrupted after three rows; how many are computed when it is started again."""
+    """A run that was interrupted after three rows; how many are computed when it is started again."""
     path = tmp_path / "reproduction.json"
     setting = EvaluationConfig(count=3)
 
@@ -693,7 +693,8 @@ def partial(tmp_path, monkeypatch):
         rows = reproduce(new_setting, path=path)
         names = [(row["law"], row["plant"], row["design"], row["gains"]) for row in rows]
         assert names == [(v.law, v.plant, v.design, v.gains) for v in variants()]
-        assert strict_json(path)["complete"] is True
+        assert strict_json(path)["rows"] == json.loads(files.dump_json(rows))
+        assert [p.name for p in tmp_path.iterdir()] == [path.name]
         return len(computed)
 
     return SimpleNamespace(path=path, again=again)
@@ -701,50 +702,19 @@ def partial(tmp_path, monkeypatch):
 
 def test_an_unchanged_run_takes_over_the_rows_that_are_there(partial):
     assert partial.again() == 29
+    assert partial.again() == 32  # a complete run is computed anew
 
 
-@pytest.mark.parametrize("change", [{"seed": 2}, {"count": 4}, {"duration": 19.0}, {"dt": 0.001}, {"starts": "rest"}])
-def test_a_run_with_another_setting_starts_anew(partial, change):
-    assert partial.again(EvaluationConfig(**{"count": 3, **change})) == 32
+@rows("change", [{"seed": 2}, {"count": 4}, {"duration": 19.0}, {"dt": 0.001}, {"starts": "rest"}])
+def test_rows_of_another_setting_are_refused(change, partial):
+    with pytest.raises(InputError, match="a place without the parts of other work"):
+        partial.again(EvaluationConfig(**{"count": 3, **change}))
 
 
-def test_a_complete_run_is_computed_anew(partial):
-    partial.again()
-    assert partial.again() == 32
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda table: {**table, "versions": {**table["versions"], "jax": "0.0.1"}},
-        lambda table: {**table, "what": "something else"},
-        lambda table: {key: value for key, value in table.items() if key != "rows"},
-        lambda table: {**table, "rows": None},
-        lambda table: {**table, "rows": {"law": "x"}},
-        lambda table: {**table, "rows": table["rows"][::-1]},
-        lambda table: {**table, "rows": [{"law": "other"}]},
-        lambda table: {**table, "rows": 40 * table["rows"]},
-    ],
-    ids=[
-        "version",
-        "what",
-        "no rows",
-        "null rows",
-        "rows no list",
-        "rows in disorder",
-        "rows of others",
-        "too many rows",
-    ],
-)
-def test_a_file_of_another_version_or_kind_is_not_taken_over(partial, damage):
-    files.write_json(partial.path, damage(files.read_table(partial.path)))
-    assert partial.again() == 32
-
-
-@pytest.mark.parametrize("content", ["", "{", "[]", "\x00", '{"complete": false}'])
-def test_a_broken_file_is_not_taken_over(partial, content):
-    partial.path.write_text(content, encoding="utf-8")
-    assert partial.again() == 32
+def test_rows_of_other_versions_are_refused(partial, monkeypatch):
+    monkeypatch.setattr(files, "versions", lambda: {"jax": "0.0.1"})
+    with pytest.raises(InputError, match="a place without the parts of other work"):
+        partial.again()
 
 
 def test_the_table_can_be_printed_where_only_ascii_is_known(monkeypatch, reproduced):

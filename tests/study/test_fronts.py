@@ -20,6 +20,7 @@ from cpjax.study.fronts.trace import FOLDS, GRADIENT_STEP, trace_fronts
 from cpjax.tune.baseline import baseline
 from cpjax.tune.objective import Lagrangian, RemainingTime, VoltageVariation
 from cpjax.tune.parameters import free_parameters
+from cpjax.workspace import Workspace
 
 PLANT = paper.appendix_plant()
 START = cpjax.State(0.05, 0.0, 3.0, 0.1)
@@ -126,15 +127,15 @@ def test_a_search_that_is_done_is_read_again_to_the_last_bit(tmp_path):
         {12.0: 5, 0.1: 6},
         7.5,
     )
-    path = tmp_path / "search.npz"
-    assert load_or_run(path, lambda: found) is found
-    again = load_or_run(path, lambda: pytest.fail("searched again"))
+    memory = Workspace(tmp_path / "parts", {})
+    assert load_or_run(memory, "search", lambda: found) is found
+    again = load_or_run(memory, "search", lambda: pytest.fail("searched again"))
     assert again[1:] == found[1:]
     assert list(again.met) == [12.0, 0.1]
     for supply, one in found.met.items():
         for kept, column in zip(again.met[supply], one, strict=True):
             np.testing.assert_array_equal(kept, column)
-    assert load_or_run(None, lambda: found) is found
+    assert load_or_run(None, "search", lambda: found) is found
 
 
 @pytest.mark.slow

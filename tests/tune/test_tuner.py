@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import cpjax
 from cpjax import paper
 from cpjax.errors import InputError
 from cpjax.tune.baseline import baseline
@@ -51,24 +52,24 @@ def test_a_checkpoint_of_another_tuning_is_refused(tuner, tmp_path):
     other = dataclasses.replace(SMALL, seed=2)
     with pytest.raises(InputError, match="same tuning"):
         tune(PLANT, tuner.free, other, checkpoint=path)
+
+
+def test_a_damaged_checkpoint_is_set_aside_and_one_of_another_kind_too(tuner, tmp_path):
+    path = tmp_path / "checkpoint.npz"
+    store(path, tuner.identity, tuner.begin())
     whole = path.read_bytes()
     with np.load(path) as content:
-        arrays = {name: content[name] for name in content.files}
-    for name, changed in (
-        ("vectors", arrays["vectors"] + 1e-9),
-        ("scores", arrays["scores"][:-1]),
-        ("note", np.frombuffer(b'{"identity": 1}', np.uint8)),
-        ("note", np.frombuffer(b"[]", np.uint8)),
-    ):
+        arrays = dict(content)
+    damaged = [whole[: len(whole) // 2], b"not a checkpoint"]
+    for name, changed in (("vectors", arrays["vectors"] + 1e-9), ("cpjax", np.asarray('{"identity": 1}'))):
         np.savez(path, **{**arrays, name: changed})
-        with pytest.raises(InputError, match="checkpoint"):
-            tune(PLANT, tuner.free, SMALL, checkpoint=path)
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match="checkpoint"):
-        tune(PLANT, tuner.free, SMALL, checkpoint=path)
-    path.write_bytes(b"not a checkpoint")
-    with pytest.raises(InputError, match="checkpoint"):
-        tune(PLANT, tuner.free, SMALL, checkpoint=path)
+        damaged.append(path.read_bytes())
+    for number, content in enumerate(damaged):
+        path.write_bytes(content)
+        with pytest.warns(cpjax.DamagedFileWarning, match=r"checkpoint\.npz\.[0-9a-f]{8}\.damaged now"):
+            assert restore(path, tuner.identity, tuner.optimiser) is None
+        assert not path.exists()
+        assert len([*tmp_path.iterdir()]) == number + 1  # nothing is lost
 
 
 def test_candidates_are_compared_on_more_starts_and_the_given_controller_stays(monkeypatch):

@@ -1,14 +1,10 @@
-"""Result of a search for trade-off fronts and its file, so that a finished search is not repeated."""
+"""Result of a search for trade-off fronts, and its partial result in a workspace."""
 
-import io as buffers
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
-
-from cpjax import files
 from cpjax.study.fronts.evaluator import Evaluated
+from cpjax.workspace import Workspace
 
 _COUNTS = ("begun", "values", "gradients")
 
@@ -28,30 +24,24 @@ class Search(NamedTuple):
     """Wall time of the whole search, not by supply [s]."""
 
 
-def load_or_run(path: Path | None, search: Callable[[], Search]) -> Search:
-    """Loads the cached result, or runs `search` and caches it.
+def load_or_run(memory: Workspace | None, name: str, search: Callable[[], Search]) -> Search:
+    """Loads a search from a workspace, or runs it and saves it there.
 
     Args:
-      path: the NPZ file, or None to run `search` without a file.
+      memory: the workspace, or None to run the search without one.
+      name: of the partial result.
       search: runs the search.
     """
-    if path is not None and path.exists():
-        with np.load(path) as archive:
-            columns = dict(archive)
-        supplies = columns["supplies"].tolist()
-        met = {
-            supply: Evaluated(*(columns[f"{i}.{n}"] for n in Evaluated._fields)) for i, supply in enumerate(supplies)
-        }
-        begun, values, gradients = (dict(zip(supplies, columns[name].tolist(), strict=True)) for name in _COUNTS)
-        return Search(met, begun, values, gradients, float(columns["seconds"]))
+    known = memory.load(name) if memory is not None else None
+    if known is not None:
+        columns, note = known
+        supplies = note["supplies"]
+        met = {v: Evaluated(*(columns[f"{i}.{field}"] for field in Evaluated._fields)) for i, v in enumerate(supplies)}
+        begun, values, gradients = (dict(zip(supplies, note[key], strict=True)) for key in _COUNTS)
+        return Search(met, begun, values, gradients, note["seconds"])
     found = search()
-    if path is not None:
-        columns = {
-            f"{i}.{name}": of[name] for i, one in enumerate(found.met.values()) for of in [one._asdict()] for name in of
-        }
-        counts = {name: np.array([getattr(found, name)[supply] for supply in found.met]) for name in _COUNTS}
-        content: dict[str, Any] = {"supplies": np.array([*found.met]), "seconds": found.seconds, **counts, **columns}
-        buffer = buffers.BytesIO()
-        np.savez(buffer, **content)
-        files.write_bytes(path, buffer.getvalue())
+    if memory is not None:
+        columns = {f"{i}.{key}": of for i, one in enumerate(found.met.values()) for key, of in one._asdict().items()}
+        counts = {key: [getattr(found, key)[supply] for supply in found.met] for key in _COUNTS}
+        memory.save(name, columns, {"supplies": [*found.met], "seconds": found.seconds, **counts})
     return found

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cpjax.controllers import DesignName, EnergySwingUp
-from cpjax.controllers.hybrid import without_design
+from cpjax.controllers.feedback import without_design
 from cpjax.numeric.pareto import nondominated
 from cpjax.plant import CartPole, with_parameters
 from cpjax.plant.initial_states import sample_starts

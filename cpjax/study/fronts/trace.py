@@ -18,7 +18,6 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -49,6 +48,7 @@ from cpjax.study.fronts.evaluator import (
 from cpjax.study.fronts.reference_point import lanes
 from cpjax.tune import descent
 from cpjax.tune.objective import Effort, Lagrangian, RemainingTime, Travel, VoltageVariation
+from cpjax.workspace import Workspace
 
 Numbers = np.ndarray[Any, Any]
 Report = Callable[[int, int, str], None]
@@ -104,7 +104,7 @@ def trace_fronts(
     *,
     supplies: tuple[float, ...] = (),
     report: Report,
-    memory: Path | None = None,
+    memory: Workspace | None = None,
 ) -> Fronts:
     """Traces the fronts of settling time against every cost at the plant's own supply, and against effort at others.
 
@@ -115,8 +115,8 @@ def trace_fronts(
       reference: reference points of the hypervolumes (2,) by (supply, cost); see `reference_points`.
       supplies: further voltage limits [V].
       report: called with the parts done, their number, and the current part in words.
-      memory: a folder in which each of the two searches is cached when it is done. A call that finds one there does not
-        repeat it; the folder must be that of the same plant, design, plan and supplies.
+      memory: a workspace in which each of the two searches is saved when it is done. A call that finds one there does
+        not repeat it.
 
     Raises:
       InputError: a plant without a voltage limit.
@@ -150,8 +150,8 @@ def trace_fronts(
         counts = {supply: len(one.vectors) for supply, one in drawn.items()}
         return Search(drawn, counts, evaluator.steps, dict.fromkeys(everywhere, 0), time.perf_counter() - begin)
 
-    traced = load_or_run(memory and memory / "traced.npz", trace)
-    random = load_or_run(memory and memory / "random.npz", draw)
+    traced = load_or_run(memory, f"{design}-traced", trace)
+    random = load_or_run(memory, f"{design}-random", draw)
     steps = {
         supply: {
             "values": traced.values[supply],
