@@ -4,9 +4,8 @@
 
 64 starts (and 4,096 in chunks of 64), 10 s at steps of 2 ms, float64, the smooth time outside the target of the
 corrected, centred law with pole placement; derivatives in eight parameters. On the sampled clock, the derivative of the
-mean beside the pathwise one. Everything is compiled first; then all ways
-run in turn, several times, so that a busy machine slows all of them. Memory is what the compiler sets aside for
-temporaries.
+mean beside the pathwise one. Everything is compiled first; then all ways run in turn, several times, so that a busy
+machine slows all of them. Memory is what the compiler sets aside for temporaries.
 """
 
 import time
