@@ -98,7 +98,8 @@ def answer(known: Cases) -> None:
 
     import cpjax
 
-    print(json.dumps({"from": cpjax.__file__, "cases": list(known)}), flush=True)
+    work = {name: work for name, (_, work, _) in known.items()}
+    print(json.dumps({"from": cpjax.__file__, "work": work}), flush=True)
     begun: set[str] = set()
     for line in sys.stdin:
         call, _, calls = known[line.strip()]
@@ -125,7 +126,7 @@ class Child:
         first = json.loads(self._line())
         if not Path(first["from"]).is_relative_to(tree.resolve()):
             raise RuntimeError(f"{first['from']} is not in {tree}")
-        self.names: list[str] = first["cases"]
+        self.work: dict[str, float] = first["work"]
 
     def _line(self) -> str:
         assert self.process.stdout is not None
@@ -158,20 +159,22 @@ def main(out: Path, quick: bool = False, against: str = "HEAD", laps: int = 20, 
     with tempfile.TemporaryDirectory() as folder:
         old = Path(folder) / "old"
         subprocess.run(["git", "worktree", "add", "--quiet", "--detach", str(old), against], cwd=here, check=True)
-        children: dict[bool, dict[str, Child]] = {}
+        children: dict[tuple[str, ...], dict[str, Child]] = {}
         try:
-            work = {name: work for name, (_, work, _) in cases().items()}
-            asked = [(name, True) for name in work] + [(name, False) for name in work if "gradient" in name]
-            asked = [("one rollout", True), ("gradient of 64", False)] if quick else asked
-            for name, configured in [each for each in asked if case in each[0]]:
-                if configured not in children:
-                    options = () if configured else ("--unconfigured",)
-                    trees = {"old": old, "new": here}
-                    children[configured] = {
-                        which: Child(tree, folder, options=options) for which, tree in trees.items()
-                    }
-                both = children[configured]
-                row: dict[str, Any] = {"case": name if configured else f"{name}, no options"}
+            modes: list[tuple[str, ...]] = [(), ("--unconfigured",)]
+            for options in modes:
+                for which, tree in {"old": old, "new": here}.items():
+                    children.setdefault(options, {})[which] = Child(tree, folder, options=options)
+            work = children[()]["new"].work
+            asked: list[tuple[str, tuple[str, ...]]] = [(name, ()) for name in work]
+            asked += [(name, ("--unconfigured",)) for name in work if "gradient" in name]
+            asked = [("one rollout", ()), ("gradient of 64", ("--unconfigured",))] if quick else asked
+            for name, options in asked:
+                label = f"{name}, no options" if options else name
+                if case not in label:
+                    continue
+                both = children[options]
+                row: dict[str, Any] = {"case": label}
                 row |= {f"first_{which}": child.seconds(name) for which, child in both.items()}
                 seconds: dict[str, list[float]] = {"old": [], "new": []}
                 for lap in range(2 if quick else laps):
