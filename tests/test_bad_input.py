@@ -711,6 +711,7 @@ def test_a_run_that_starts_outside_the_limits_is_flagged_at_once_and_held_there(
     assert set(np.asarray(result.state.x)) == {2e3}
 
 
+@pytest.mark.slow
 @rows("clock", ["sampled", "continuous"])
 @rows("gain", [1e3, 1e12, 1e150])  # with 1e300, d effort / d reference itself is beyond float64
 def test_the_gradient_of_a_flagged_run_is_finite_where_its_parameters_are(gain, clock):

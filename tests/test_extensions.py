@@ -36,10 +36,9 @@ EXAMPLES = {
     "recorded voltage": (recorded, "voltages"),
 }
 """What makes each, and the field whose numbers its derivative is taken in."""
-MARKED = [
-    pytest.param(name, marks=[pytest.mark.slow] * (name in ("observer", "square wave")), id=name) for name in EXAMPLES
-]
-"""Two of them take minutes of compiling, and are like the others."""
+MARKED = ["dead time", "recorded voltage"]
+MARKED += [pytest.param(name, marks=pytest.mark.slow, id=name) for name in EXAMPLES if name not in MARKED]
+"""The slow ones take a minute of compiling each, and are like the others."""
 RUN = {"duration": 0.5, "dt": 0.002}
 
 
@@ -346,6 +345,7 @@ def bounced_by_scipy(duration):
     return s, bounces
 
 
+@pytest.mark.slow
 def test_the_events_of_a_plant_are_located_on_the_sampled_clock():
     end, bounces = bounced_by_scipy(1.4)
     assert bounces == 3
@@ -376,6 +376,7 @@ def test_the_derivative_through_a_plants_events_is_that_of_differences():
         assert float(gradient[i] * p[i]) == pytest.approx(float(found), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_on_the_continuous_clock_the_walls_stand_beside_clip_and_gate():
     controller = cpjax.paper.controller("corrected-centred", "placement", PLANT)
     walls = dataclasses.replace(WALLED, half_length=0.35)

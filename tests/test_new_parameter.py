@@ -261,6 +261,7 @@ np.testing.assert_allclose(swept.cart_travel, np.max(np.abs(slowed.x)), rtol=1e-
 """
 
 
+@pytest.mark.slow
 def test_a_parameter_added_by_one_declaration_and_one_term_works_everywhere(tmp_path):
     source = Path(cpjax.__file__).parent
     shutil.copytree(source, tmp_path / "cpjax", ignore=shutil.ignore_patterns("__pycache__"))

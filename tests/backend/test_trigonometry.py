@@ -80,6 +80,7 @@ def test_forward_and_reverse_derivatives_are_cosine_and_minus_sine_to_the_last_b
     np.testing.assert_array_equal(jax.vmap(jax.grad(lambda a: sin_cos(a)[1]))(angle), -sin)
 
 
+@pytest.mark.slow
 @DTYPES
 @rows("outer", [jax.jacfwd, jax.jacrev])
 @rows("inner", [jax.jacfwd, jax.jacrev])

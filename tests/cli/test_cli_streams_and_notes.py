@@ -139,6 +139,7 @@ import cpjax
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
+@pytest.mark.slow
 def test_an_interrupt_that_python_drops_in_a_callback_comes_again():
     script = """
 import gc, os, signal, sys, time

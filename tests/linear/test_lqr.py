@@ -77,6 +77,7 @@ def test_the_paper_plant_has_the_gain_that_follows_from_its_weights():
     assert relative_error(discrete.K, control.dlqr(*PAPER["discrete"])[0]) <= 1e-10
 
 
+@pytest.mark.slow
 @continuous_discrete_slow
 def test_only_the_ratio_of_the_weights_matters(time):
     A, B, Q, R = PAPER[time]
@@ -127,6 +128,7 @@ def test_a_cross_term_is_a_feedback_that_is_already_there(time):
     np.testing.assert_array_equal(DESIGNS[time](A, B, Q, R, np.zeros((4, 1))).K, DESIGNS[time](A, B, Q, R).K)
 
 
+@pytest.mark.slow
 def test_the_solution_is_the_cost_of_coming_to_rest_and_no_gain_costs_less():
     rng = np.random.default_rng(5)
     A, B, Q, R, N = random_problem(4, 1, rng)
@@ -147,6 +149,7 @@ def test_the_solution_is_the_cost_of_coming_to_rest_and_no_gain_costs_less():
         assert cost(K + 0.01 * rng.normal(size=K.shape)) > best
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("a", "b", "q", "r"), [(1.3, -0.7, 2.1, 0.3), (-2.0, 1.0, 0.5, 4.0), (0.0, 3.0, 1.0, 1.0)])
 def test_one_state_has_the_gain_of_a_quadratic_equation(a, b, q, r):
     problem = [np.array([[x]]) for x in (a, b, q, r)]

@@ -486,6 +486,7 @@ def test_second_derivatives_are_those_of_the_first():
     np.testing.assert_allclose(curvature[finite], expected[finite], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_margins_and_their_derivatives_are_the_same_under_vmap():
     loops = [*LOOPS.values(), (LOOPS["placement"][0], LOOPS["placement"][1], -LOOPS["placement"][2])]
     batch = tuple(jnp.stack([jnp.asarray(m) for m in matrices]) for matrices in zip(*loops, strict=True))

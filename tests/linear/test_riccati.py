@@ -80,6 +80,7 @@ def test_without_state_weights_a_stable_plant_is_left_alone_exactly(time):
     np.testing.assert_array_equal(K, np.zeros((1, 4)))
 
 
+@pytest.mark.slow
 @both
 def test_a_stable_mode_that_no_weight_sees_costs_nothing(time):
     modes = [-1e-3, 1.0] if time == "continuous" else [0.999, 1.5]
@@ -111,6 +112,7 @@ def test_without_an_effective_input_the_solution_is_that_of_lyapunovs_equation(t
     np.testing.assert_array_equal(K, np.zeros((1, 2)))
 
 
+@pytest.mark.slow
 @both
 def test_the_closed_loop_is_stable_and_the_solution_symmetric_and_semidefinite(time):
     rng = np.random.default_rng(2)

@@ -104,6 +104,7 @@ def test_a_singular_unweighed_discrete_plant_has_its_unstable_pole_mirrored():
     np.testing.assert_allclose(K, [[0.0, 8.0 / 3.0]], rtol=1e-15, atol=1e-30)
 
 
+@pytest.mark.slow
 def test_a_repeated_pole_without_weight_is_mirrored_as_often_as_it_is_there():
     K, _ = lqr(np.array([[1.0, 1.0], [0.0, 1.0]]), LAST, NONE, ONE)  # (s - 1)^2 becomes (s + 1)^2
     np.testing.assert_allclose(K, [[4.0, 4.0]], rtol=1e-15)
@@ -218,6 +219,7 @@ def test_an_unweighed_mode_on_the_stability_boundary_is_refused_by_its_eigenvalu
         DESIGNS[time](A, B, NONE, ONE)
 
 
+@pytest.mark.slow
 @both
 def test_inside_jit_an_unweighed_boundary_mode_is_nan_in_its_own_elements_only(time):
     bad = [(A, B, NONE, ONE) for kind, A, B, _ in ON_BOUNDARY.values() if kind == time]

@@ -37,6 +37,7 @@ def test_the_identified_plant_differs_from_the_appendix_in_two_numbers():
             assert getattr(APPENDIX, field.name) == getattr(IDENTIFIED, field.name)
 
 
+@pytest.mark.slow
 def test_the_gains_computed_from_the_appendix_are_not_the_printed_ones():
     computed = {"placement": (-25.688, -25.404, 115.997, 29.683), "lqr": (-1414.214, -1179.574, 4797.709, 967.239)}
     for design, values in computed.items():

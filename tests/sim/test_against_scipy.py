@@ -177,6 +177,7 @@ def test_switching_per_step_is_of_first_order(errors_by_step):
     assert np.all(after.mean(axis=1) > 10.0 * before.mean(axis=1))  # it is the switch that errs
 
 
+@pytest.mark.slow
 def test_the_error_after_the_switch_is_in_proportion_to_its_delay_to_the_next_step(continuous, errors_by_step):
     steps, _, after = errors_by_step
     delays = -continuous.switch_times % steps[:, None]

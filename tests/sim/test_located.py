@@ -55,6 +55,7 @@ def located(plant, controller, start, **settings):
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_without_clip_and_crossing_it_is_the_rollout_that_reads_its_mode_per_step():
     plant = replace(PLANT, motor=replace(PLANT.motor, voltage_limit=math.inf))
     law = loop(plant=plant).swing_up
@@ -91,6 +92,7 @@ def test_samples_are_on_the_grid_inside_the_supply_and_in_the_gates_mode(gate):
     np.testing.assert_allclose(run.voltage, np.clip(demand, -12.0, 12.0), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_metrics_see_what_happens_inside_the_steps():
     coarse, fine = (located(PLANT, SOFT, NEAR, dt=dt).metrics for dt in (4e-3, 2.5e-4))
     for name, tolerance in (("effort", 1e-3), ("voltage_variation", 1e-3), ("cart_travel", 1e-4)):

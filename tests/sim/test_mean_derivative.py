@@ -49,6 +49,7 @@ def test_all_of_these_cross_once():
     assert set(np.asarray(swept.switches).tolist()) == {1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrapped", "steps"),
     [(False, 1), pytest.param(True, 1, marks=SLOW), pytest.param(False, 2, marks=SLOW)],
@@ -114,8 +115,8 @@ def differences(i, wrap, metrics, count=40_000, move=4e-3):
 @pytest.mark.parametrize(
     ("delayed", "metrics"),
     [
-        pytest.param(False, cpjax.TimeOutside(), marks=SLOW),
-        (False, Effort()),
+        (False, cpjax.TimeOutside()),
+        pytest.param(False, Effort(), marks=SLOW),
         pytest.param(True, cpjax.TimeOutside(), marks=SLOW),
     ],
     ids=["time outside", "effort", "time outside with a dead time"],

@@ -84,7 +84,7 @@ class RandomMemory:
         return (own, inner), command
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
 @pytest.mark.filterwarnings("ignore::cpjax.PerformanceWarning")  # it has matrix products
 def test_a_random_controller_is_the_same_in_rollout_measure_and_sweep_traced_or_not(seed):
     rng = np.random.default_rng(seed)
@@ -296,23 +296,28 @@ def outside(gain, controller=CENTRED, **settings):
     return cpjax.measure(PLANT, changed, cpjax.HANGING, metrics=cpjax.TimeOutside(), **{**RUN, **settings})
 
 
+def trace(function):
+    """Traces the derivative, which is when it warns; computing it would take a compilation."""
+    jax.make_jaxpr(jax.grad(function))(5.0)
+
+
 @pytest.mark.parametrize("clock", ["sampled", "continuous"])
 def test_a_derivative_that_misses_the_switch_warns_unless_it_is_asked_for_by_name(clock):
     with pytest.warns(cpjax.DerivativeWarning, match="leaves out how its change of mode moves"):
-        jax.grad(lambda gain: outside(gain, clock=clock, duration=0.104))(5.0)
+        trace(lambda gain: outside(gain, clock=clock, duration=0.104))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        jax.grad(lambda gain: outside(gain, clock=clock, derivative="pathwise"))(5.0)
+        trace(lambda gain: outside(gain, clock=clock, derivative="pathwise"))
         outside(5.0, clock=clock)
 
 
 def test_a_derivative_that_has_its_switch_does_not_warn():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        jax.grad(lambda gain: outside(gain, switching="located"))(5.0)
-        jax.grad(lambda gain: outside(gain, derivative="mean"))(5.0)
+        trace(lambda gain: outside(gain, switching="located"))
+        trace(lambda gain: outside(gain, derivative="mean"))
         law = cpjax.StateFeedback([1.0, 2.0, 3.0, 4.0])
-        jax.grad(lambda k: cpjax.measure(PLANT, cpjax.StateFeedback(law.K * k), cpjax.HANGING, **RUN).effort)(1.0)
+        trace(lambda k: cpjax.measure(PLANT, cpjax.StateFeedback(law.K * k), cpjax.HANGING, **RUN).effort)
 
 
 def test_the_derivative_of_the_mean_is_refused_where_it_has_no_meaning():

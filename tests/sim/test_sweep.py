@@ -52,6 +52,7 @@ def test_the_result_does_not_depend_on_chunks_and_blocks():
     assert_same(cpjax.sweep(PLANT, CENTRED, starts, duration=0.4, **SAMPLED, chunk=3), whole, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-9), (np.float32, 3e-3)])
 def test_turned_stage_angles_give_what_full_ones_give(dtype, tolerance):
     starts = cpjax.sample_starts("anywhere", 64, seed=5, dtype=dtype)
@@ -60,6 +61,7 @@ def test_turned_stage_angles_give_what_full_ones_give(dtype, tolerance):
     assert_same(fast, one_by_one(starts, duration=0.5, **SAMPLED), rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [49.0, 51.0, 600.0])
 def test_a_pole_too_fast_for_turns_is_computed_in_full(speed):
     """At 50 rad/s a step of 2 ms turns the pole by 0.1 rad."""

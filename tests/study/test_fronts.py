@@ -26,6 +26,7 @@ PLANT = paper.appendix_plant()
 START = cpjax.State(0.05, 0.0, 3.0, 0.1)
 
 
+@pytest.mark.slow
 def test_the_time_that_is_minimised_has_every_cost_at_its_price():
     law = baseline("lqr", PLANT)
     run = {"duration": 2.0, "dt": 0.005, "clock": "sampled"}

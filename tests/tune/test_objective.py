@@ -81,6 +81,7 @@ def test_a_track_weight_needs_a_limit_and_a_goal_a_weight():
         Goal(time=0.0)
 
 
+@pytest.mark.slow
 def test_what_a_stopped_run_leaves_undone_counts_as_badly_spent():
     """Two spare steps are too few for the first swings: a run that is stopped early must not look the better one."""
     goal = Goal(effort=0.01)
