@@ -21,12 +21,12 @@ def commands(page):
 
 def test_the_python_of_the_readme_runs(capsys):
     blocks = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    assert len(blocks) >= 3
+    assert len(blocks) == 2
     exec(compile("\n".join(blocks), "README.md", "exec"), {})
     first, second, third = capsys.readouterr().out.splitlines()
-    assert first.startswith("True 3.4")
-    assert float(second) > 0.9
-    assert abs(float(third)) > 1e-6
+    assert first.startswith("True 2.4")
+    assert float(second) == 1.0
+    assert 1e-6 < abs(float(third)) < 10.0
 
 
 @pytest.mark.slow
@@ -89,13 +89,15 @@ def test_every_test_that_the_paper_page_names_exists():
 
 
 @pytest.mark.slow
-def test_the_success_table_of_the_readme_is_what_reproduce_finds():
+def test_the_success_table_of_the_paper_page_is_what_reproduce_finds():
     rows = reproduce(EvaluationConfig(count=4096, seed=1))
-    table = re.findall(r"^\| ([\w-]+) \| (appendix|identified) \| ([\d.]+) %.*\| ([\d.]+) %.*\|$", README, re.MULTILINE)
-    assert len(table) == 8
-    for law, plant, *printed in table:
-        for design, text in zip(("placement", "lqr"), printed, strict=True):
-            keys = {"law": law, "plant": plant, "design": design, "gains": "printed"}
-            row = next(r for r in rows if all(r[k] == v for k, v in keys.items()))
-            # A start on the edge of success may fall either way on another processor: 4 of 4,096 is 0.1 point.
-            assert abs(100 * row["success_rate"] - float(text)) < 0.1, keys
+    page = (ROOT / "docs" / "paper.md").read_text()
+    line = r"^\| ([\w-]+) \| (appendix|identified) \| (pole placement|LQR) \| ([\d.]+) %"
+    table = re.findall(line, page, re.MULTILINE)
+    assert len(table) == 12
+    for law, plant, regulator, printed in table:
+        design = {"LQR": "lqr", "pole placement": "placement"}[regulator]
+        keys = {"law": law, "plant": plant, "design": design, "gains": "printed"}
+        row = next(r for r in rows if all(r[k] == v for k, v in keys.items()))
+        # A start on the edge of success may fall either way on another processor: 4 of 4,096 is 0.1 point.
+        assert abs(100 * row["success_rate"] - float(printed)) < 0.1, keys
