@@ -13,8 +13,10 @@ report: .venv/ready  ## the main job: the paper's controllers, reproduced, as on
 report-full: .venv/ready  ## the same with finer maps and full fronts: some fifteen minutes
 	$(BIN)/cpjax report --count 10000 --cells 512 --studies full --out $(OUT)/report-full
 
+# Most of its time is spent on compiling what then runs for milliseconds, so the compiler optimises less. The slow tests
+# and tests/backend run what users run.
 test: check  ## linter, type checker, tests with warnings as errors
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 
 test-slow: .venv/ready-test  ## the tests that take minutes
 	$(BIN)/python -m pytest -n 2 -m slow

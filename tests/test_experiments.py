@@ -15,6 +15,7 @@ SLOW = {  # a minute of compiling each, or what the package's own tests hold any
     "accuracy",
     "benchmark",
     "benchmark_design",
+    "damages",
     "gradient_accuracy",
     "gradient_cost",
     "kill_and_resume",

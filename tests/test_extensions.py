@@ -36,7 +36,7 @@ EXAMPLES = {
     "recorded voltage": (recorded, "voltages"),
 }
 """What makes each, and the field whose numbers its derivative is taken in."""
-MARKED = ["dead time", "recorded voltage"]
+MARKED = ["dead time"]
 MARKED += [pytest.param(name, marks=pytest.mark.slow, id=name) for name in EXAMPLES if name not in MARKED]
 """The slow ones take a minute of compiling each, and are like the others."""
 RUN = {"duration": 0.5, "dt": 0.002}

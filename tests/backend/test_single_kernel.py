@@ -71,7 +71,11 @@ def fresh():
     runtime.jaxlib_is_tested.cache_clear()
 
 
-@pytest.mark.parametrize("options", [{}, {"clock": "continuous", "switching": "located"}], ids=["per_step", "located"])
+@pytest.mark.parametrize(
+    "options",
+    [{}, pytest.param({"clock": "continuous", "switching": "located"}, marks=pytest.mark.slow)],
+    ids=["per_step", "located"],
+)
 def test_a_rollout_is_one_function_and_so_are_the_passes_of_its_derivative(options):
     def cost(theta):
         return effort(near(theta), CENTRED, **options)
@@ -85,8 +89,10 @@ def test_a_rollout_is_one_function_and_so_are_the_passes_of_its_derivative(optio
     [
         {"derivative": "pathwise"},
         {"derivative": "mean"},
-        {"clock": "continuous", "derivative": "pathwise"},
-        {"clock": "continuous", "switching": "located"},
+        *(
+            pytest.param({"clock": "continuous"} | one, marks=pytest.mark.slow)
+            for one in ({"derivative": "pathwise"}, {"switching": "located"})
+        ),
     ],
     ids=["sampled", "mean", "per_step", "located"],
 )

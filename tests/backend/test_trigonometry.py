@@ -115,6 +115,7 @@ def test_a_turned_sine_and_cosine_are_within_two_ulp_of_one(dtype, compiled):
         assert np.max(np.abs(np.asarray(value) - reference)) <= 2 * np.finfo(dtype).eps
 
 
+@pytest.mark.slow
 @DTYPES
 def test_the_derivative_of_a_turn_is_that_of_sine_and_cosine(dtype):
     turn = jnp.linspace(-LARGEST_TURN, LARGEST_TURN, 101, dtype=dtype)

@@ -144,6 +144,7 @@ def test_the_disk_margins_are_python_controls(plant, design):
     assert found["disk_phase"] == pytest.approx(math.radians(phase), rel=1e-10)
 
 
+@pytest.mark.slow
 @rows("n", [2, 4, 6])
 def test_no_margin_of_a_random_loop_is_missed_that_a_dense_grid_finds(n):
     for loop in random_loops(n, 25, seed=1):

@@ -130,6 +130,7 @@ def test_the_closed_loop_is_stable_and_the_solution_symmetric_and_semidefinite(t
         assert np.min(np.linalg.eigvalsh(one / size / size[:, None])) >= -1e-12
 
 
+@pytest.mark.slow
 @continuous_discrete_slow
 def test_only_the_symmetric_part_of_a_weight_counts(time):
     A, B, Q = np.array([[0.0, 1.0], [1.2, 0.3]]), np.array([[0.0], [1.0]]), np.array([[2.0, 1.0], [1.0, 3.0]])

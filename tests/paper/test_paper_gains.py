@@ -47,6 +47,7 @@ def test_the_gains_computed_from_the_appendix_are_not_the_printed_ones():
         assert off.tolist() == [design != "lqr", True, True, True]
 
 
+@pytest.mark.slow
 def test_the_first_lqr_gain_says_nothing_about_the_plant():
     for plant in (APPENDIX, IDENTIFIED, dataclasses.replace(APPENDIX, pole_length=0.5, pole_mass=0.3)):
         first = paper.computed_gain("lqr", plant)[0, 0]

@@ -75,6 +75,7 @@ def hanging_starts():
 # The law as printed, and what mending only a part of it does
 
 
+@pytest.mark.slow
 @both_plants
 def test_the_printed_law_swings_up_from_a_small_offset_and_never_stops_pumping(plant):
     offsets = at(math.pi - np.array([1e-3, 1e-2, 1e-1]))

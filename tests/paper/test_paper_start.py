@@ -71,6 +71,7 @@ UNKICKED = {
 }
 
 
+@pytest.mark.slow
 @rows("numbers", UNKICKED, ids=str)
 @both_clocks
 def test_only_rounding_starts_the_energy_law_without_a_kick_and_it_takes_its_time(numbers, clock):
@@ -211,6 +212,7 @@ def test_derivatives_from_hanging_rest_are_finite_and_those_of_central_differenc
         assert float(slope) == pytest.approx(float(above - below) / (2 * step), rel=1e-5, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_of_a_whole_run_from_hanging_rest_are_finite():
     def effort(law, start):
         return finish(law, start, duration=6.0, clock="sampled", derivative="pathwise").metrics.effort

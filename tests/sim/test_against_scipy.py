@@ -186,6 +186,7 @@ def test_the_error_after_the_switch_is_in_proportion_to_its_delay_to_the_next_st
     np.testing.assert_allclose(per_delay, per_delay[-1], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_the_clip_before_the_switch_is_of_second_order(errors_by_step):
     steps, before, _ = errors_by_step
     assert fitted_order(steps, before.mean(axis=1)) == pytest.approx(2.0, abs=0.2)
