@@ -114,6 +114,8 @@ class Workspace:
             self._handle = None
             allowed = "a folder in which no other process works: wait for it, or choose another one"
             raise InputError("path", str(self.folder), allowed) from problem
+        except OSError:
+            pass  # a file system without locks: as on Windows
 
     def _leave(self) -> None:
         if self._handle is not None:

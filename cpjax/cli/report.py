@@ -78,9 +78,12 @@ def written(
     results, shown_start = compared(given.out, paper.appendix_plant(), setting, {})
     page = Page(
         "Swing-up at 12 volts",
-        "A student paper swings a pendulum up with an energy law and catches it with LQR or pole placement. "
-        "Here are its controllers, as printed and as corrected, run from many starts.",
+        "A student paper swings a pendulum up with an energy law and catches it with LQR or pole placement: here are "
+        "its controllers, as printed, as corrected and as tuned by gradients, run from many starts.",
     )
+    page.numbers(comparison.headline(results))
+    picture = save_figure(given.out / "success.png", success_rates(rows))
+    page.picture(picture, "Share of starts caught by each law, plant and regulator, with 95 % intervals.")
     page.section("Setup")
     page.text(
         f"{setting.count} starts from the set `{setting.starts}` (seed {setting.seed}), {setting.duration:g} s each, "
@@ -98,8 +101,6 @@ def written(
     page.section("Results")
     for sentence in (*findings(rows), comparison.findings(results)[-1]):
         page.text(sentence)
-    picture = save_figure(given.out / "success.png", success_rates(rows))
-    page.picture(picture, "Share of starts caught by each law, plant and regulator, with 95 % intervals.")
     page.table(HEADER, [cells(row) for row in rows], text_columns=4)
     page.note(
         "Settling, travel, effort and variation are over the successful runs, the peak voltage over all. "

@@ -37,6 +37,19 @@ HEADER = (
 )
 
 
+def headline(results: Sequence[Compared]) -> list[tuple[str, str, str]]:
+    """Returns the success rates of the paper's printed and of the tuned controllers: value, interval, what it is."""
+    chosen = [one for one in results if one.entry.gains == "tuned" or one.entry.name == "paper, as printed"]
+    numbers = []
+    for one in chosen:
+        if one.entry.gains != "computed":
+            low, high = one.summary["success_interval"]
+            value = f"{100 * one.summary['success_rate']:.1f} %"
+            what = f"of starts settle: {one.entry.name}, {DESIGN_NAMES[one.entry.design]}"
+            numbers.append((value, f"({100 * low:.1f} to {100 * high:.1f})", what))
+    return numbers
+
+
 def cells(one: Compared) -> list[str]:
     """Returns a row of the table: means over the successful runs, and the longest settling time."""
     good: Mapping[str, Any] = one.summary["over_successes"]

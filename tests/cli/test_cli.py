@@ -783,10 +783,22 @@ def test_a_report_is_one_valid_page_that_loads_nothing_from_elsewhere(report):
     for tag, attributes in report.page.tags:
         assert not [name for name in attributes if name.startswith("on")]
         for name in ("href", "src", "srcset", "data", "action"):
-            assert name not in attributes or (tag == "img" and attributes[name].startswith("data:image/png;base64,"))
+            own = {"img": "data:image/png;base64,", "a": "#part-"}.get(tag, "nothing")
+            assert name not in attributes or attributes[name].startswith(own)
     assert "@import" not in report.text
     assert "url(" not in report.text
     assert "http" not in re.sub(r"data:image/png;base64,[^\"]*", "", report.text)
+
+
+def test_a_report_begins_with_four_numbers_a_picture_and_links_to_its_parts(report):
+    kinds = [(tag, attributes) for tag, attributes in report.page.tags if tag in ("b", "img", "a", "h2")]
+    assert [tag for tag, _ in kinds[:5]] == ["b"] * 4 + ["img"]
+    assert kinds[5][0] == "a"
+    links = [attributes["href"] for tag, attributes in kinds if tag == "a"]
+    assert links == [f"#{attributes['id']}" for tag, attributes in kinds if tag == "h2"]
+    rows = document(report.folder, "compare.json")["rows"]
+    rates = [f"{100 * row['success_rate']:.1f} %" for row in rows if row["gains"] == "tuned"]
+    assert [word for word in report.page.words if word.endswith(" %")][2:4] == rates
 
 
 def test_every_picture_of_a_report_is_inside_it_and_described(report):
