@@ -360,6 +360,7 @@ def test_the_events_of_a_plant_are_located_on_the_sampled_clock():
     assert_close(swept, mapped(starts), 1e-9)
 
 
+@pytest.mark.slow
 def test_the_derivative_through_a_plants_events_is_that_of_differences():
     def end(p):
         plant = dataclasses.replace(WALLED, restitution=p[0], half_length=p[1])

@@ -53,7 +53,7 @@ class Page:
 
     @property
     def _body(self) -> list[str]:
-        """What is added to: the head of the page before its first section."""
+        """Returns the list that content is added to: before the first section, the head of the page."""
         return self._parts if self._sections else self._head
 
     def section(self, title: str) -> None:

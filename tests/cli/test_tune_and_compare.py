@@ -135,6 +135,7 @@ def test_a_comparison_has_the_papers_eight_and_two_tuned_and_ranks_the_tuned_fir
         assert tuned.summary["success_rate"] > papers.summary["success_rate"]
 
 
+@pytest.mark.slow
 def test_compare_writes_its_table_and_pictures(tmp_path, command):
     done = command("compare", "--count", "4", "--duration", "4", "--dt", "0.004", "--out", tmp_path)
     assert done.code == 0

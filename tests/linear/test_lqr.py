@@ -199,6 +199,7 @@ def test_sixteen_states_with_one_output_weighed_have_scipys_gain(dtype, m, toler
     assert max(errors) <= tolerance, f"{np.sum(np.isinf(errors))} of 20 not found"
 
 
+@pytest.mark.slow
 @both
 def test_whatever_batch_a_problem_is_solved_in_it_has_the_same_gain(time):
     A, B, Q, R = PAPER[time]

@@ -427,6 +427,7 @@ def richardson(function, h):
     return (16 * once[1] - once[0]) / 15
 
 
+@pytest.mark.slow
 @every_loop
 def test_every_finite_margins_derivative_agrees_with_differences(loop):
     loop = tuple(map(jnp.asarray, loop))

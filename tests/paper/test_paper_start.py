@@ -49,6 +49,7 @@ def time_to_leave(trajectory):
     return float(trajectory.time[np.argmax(gone)]) if gone.any() else math.inf
 
 
+@pytest.mark.slow
 @both_plants
 @both_clocks
 def test_the_law_as_printed_never_starts_from_exact_rest(plant, clock):

@@ -207,6 +207,7 @@ def test_located_switching_is_of_fourth_order_across_clip_and_switch(located_err
     assert fitted_order(steps[:3], after.mean(axis=1)[:3]) >= 3.7
 
 
+@pytest.mark.slow
 def test_located_the_loop_is_scipys_through_the_first_catch(located_errors_by_step):
     _, before, after = located_errors_by_step
     assert before[-1].max() <= 1e-8
