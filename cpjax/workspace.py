@@ -103,6 +103,13 @@ class Workspace:
             raise InputError("path", str(path), "a partial result of this computation")
         return arrays, note["note"]
 
+    def _is_part(self, path: Path) -> bool:
+        try:
+            self._read(path)
+        except InputError:
+            return False
+        return True
+
     def _acquire(self) -> None:
         if fcntl is None:
             return
@@ -126,27 +133,27 @@ class Workspace:
     def _refuse_foreign(self) -> None:
         """Raises InputError if the folder holds anything but partial results of this request."""
         for path in sorted(self.folder.iterdir()):
-            if path == self._record or path.name.startswith(".") or path.suffix == _DAMAGED:
+            if path == self._record or path.name.startswith(".") or path.suffix == _DAMAGED or self._is_part(path):
                 continue
-            try:
-                self._read(path)
-            except InputError as problem:
-                allowed = (
-                    "a place without the parts of other work (other options, starts or versions); "
-                    f"{path.name} in it is of such work: delete the folder first"
-                )
-                raise InputError("path", str(self.folder), allowed) from problem
+            allowed = (
+                "a place without the parts of other work (other options, starts or versions); "
+                f"{path.name} in it is of such work: delete the folder first"
+            )
+            raise InputError("path", str(self.folder), allowed)
 
     def _remove(self) -> None:
         # Renamed first, so that an interruption leaves nothing under this name. Files of others stay. A name with a dot
         # is that of a file whose writing was interrupted.
-        if all(path in self._own or path.name.startswith(".") for path in self.folder.iterdir()):
+        # A part that this run did not need is its own all the same.
+        inside = {*self.folder.iterdir()}
+        own = {path for path in inside if path in self._own or path.name.startswith(".") or self._is_part(path)}
+        if own == inside:
             away = self.folder.with_name(f".{self.folder.name}.{os.getpid()}-{secrets.token_hex(4)}")
             self.folder.replace(away)
             shutil.rmtree(away)
         else:
-            for path in self._own:
-                path.unlink(missing_ok=True)
+            for path in own:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def intact(path: Path, read: Callable[[Path], Result]) -> Result | None:

@@ -115,6 +115,12 @@ def test_a_stopped_removal_leaves_nothing_that_could_be_taken_for_parts(tmp_path
     assert not folder.exists()
 
 
+def test_parts_that_a_resumed_run_did_not_need_are_removed_too(tmp_path):
+    stopped(tmp_path / "parts", "unneeded")
+    assert work(tmp_path / "parts", {"seed": 1}) == []
+    assert not (tmp_path / "parts").exists()
+
+
 def test_the_left_over_of_a_killed_write_is_removed_too(tmp_path):
     stopped(tmp_path / "parts", "first")
     (tmp_path / "parts" / ".first.npz.12-ab").write_bytes(b"half")
