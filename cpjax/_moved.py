@@ -71,8 +71,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         module = types.ModuleType(spec.name, f"Old name of {now}.")
         real = importlib.import_module(now)
         # A module of its own rather than the real one: the import system writes its name and spec into it.
-        # mypy takes the hook of a module for a method that must not be replaced; modules have it to be set (PEP 562).
-        module.__getattr__ = lambda name: getattr(real, name)  # type: ignore[method-assign]
+        module.__getattr__ = lambda name: getattr(real, name)  # type: ignore[method-assign]  # a hook to be set (PEP 562)
         return module
 
     def exec_module(self, module: types.ModuleType) -> None:

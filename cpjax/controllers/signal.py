@@ -57,8 +57,8 @@ class VoltageSignal:
 
     def update(self, memory: SignalMemory, measurement: object) -> tuple[SignalMemory, Scalar]:
         """Returns the new memory and the voltage of this instant [V]."""
-        # When a voltage begins is a control instant, which does not move with the times: they are only searched.
-        times, voltages = lax.stop_gradient(jnp.asarray(self.times)), jnp.asarray(self.voltages)
+        times = lax.stop_gradient(jnp.asarray(self.times))  # only searched: a control instant does not move with them
+        voltages = jnp.asarray(self.voltages)
         count = times.shape[0]
 
         def is_due(index: jax.Array) -> jax.Array:
