@@ -11,6 +11,7 @@ only for versions of jaxlib and around operations that they were tested with, wh
 """
 
 import functools
+import math
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -27,6 +28,9 @@ from cpjax.pytree import hide, reveal
 
 LARGEST = 1 << 14
 """Largest number of elements in a result of a marked call. Above it, XLA divides each operation among the cores."""
+
+LARGEST_SUM = 1 << 12
+"""Number of elements from which on XLA hands a reduction to another library, which no marked function may contain."""
 
 _ALLOWED = """
 func.func func.call func.return stablehlo.return stablehlo.while stablehlo.case stablehlo.if stablehlo.reduce
@@ -194,6 +198,7 @@ _SLOW = {
     "stablehlo.dot_general": "a product of matrices",
     "stablehlo.custom_call": "a call into another library (a solver, a callback)",
     "stablehlo.sort": "a sort",
+    "stablehlo.reduce": f"a sum over {LARGEST_SUM} numbers or more, those of all initial states together",
 }
 """Unsupported operations that a user's law may contain, in words."""
 
@@ -207,13 +212,19 @@ def _others(function: Any, symbols: Any) -> set[str]:
         if operation.name == "func.call" and operation.attributes["callee"].value not in known:
             known.add(operation.attributes["callee"].value)
             waiting.append(symbols[operation.attributes["callee"].value])
-        if operation.name not in names:
+        large = operation.name == "stablehlo.reduce" and _size(operation.operands[0]) >= LARGEST_SUM
+        if large or operation.name not in names:
             others.add(operation.name)
         return ir.WalkResult.ADVANCE
 
     while waiting:
         waiting.pop().operation.walk(look)
     return others
+
+
+def _size(value: Any) -> int:
+    """Returns the number of elements of an array in a program."""
+    return math.prod(ir.RankedTensorType(value.type).shape)
 
 
 _whole, _part = _Marks("one_function", _mark_whole), _Marks("part_of_step", _mark_part)

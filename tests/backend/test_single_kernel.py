@@ -1,5 +1,6 @@
 """Loops that the compiler makes one function of: which ones, and that nothing but speed depends on it."""
 
+import contextlib
 import warnings
 
 import jax
@@ -108,6 +109,18 @@ def test_each_pass_of_a_derivative_in_all_numbers_is_one_function(options):
 def test_a_batch_too_large_for_one_core_stays_shared_out():
     starts = jnp.linspace(2.0, 3.0, single_kernel.LARGEST + 1)
     assert WHOLE not in lowered(jax.vmap(lambda theta: effort(near(theta), CENTRED)), starts)
+
+
+@pytest.mark.parametrize(("count", "fits"), [(1023, True), (1024, False)])
+def test_a_sum_that_xla_hands_to_another_library_is_not_part_of_a_kernel(count, fits):
+    """Such a loop failed to compile."""
+    controller = law(lambda law, state: jnp.sum(law.gain * state.vector()))()
+    function = jax.vmap(lambda theta: effort(near(theta), controller))
+    starts = jnp.linspace(2.0, 3.0, count)
+    with contextlib.nullcontext() if fits else pytest.warns(cpjax.PerformanceWarning, match="a sum over 4096 numbers"):
+        assert (WHOLE in lowered(function, starts)) == fits
+    with warnings.catch_warnings(action="ignore"):
+        assert np.all(np.isfinite(jax.jit(function)(starts)))
 
 
 @pytest.mark.slow

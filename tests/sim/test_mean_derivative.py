@@ -121,6 +121,7 @@ def differences(i, wrap, metrics, count=40_000, move=4e-3):
     ],
     ids=["time outside", "effort", "time outside with a dead time"],
 )
+@pytest.mark.filterwarnings("ignore::cpjax.PerformanceWarning")  # sums over the waiting commands of 4,000 runs at once
 def test_it_is_that_of_differences_of_the_mean_within_three_standard_errors(delayed, metrics):
     wrap = (lambda controller: dead_time.example(controller)[0]) if delayed else (lambda controller: controller)
     by_run = derivatives(catching(4_000, 4), wrap, metrics, derivative="mean", dt=0.002)
