@@ -5,15 +5,19 @@ The constructors of components, a rollout, the command line's options, the files
 
 import dataclasses
 import functools
+import inspect
 import math
+import warnings
 from collections.abc import Callable
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from cpjax.errors import InputError
+
+T = TypeVar("T")
 
 RULE = "cpjax"
 """Key of a field's declaration in the metadata of dataclasses."""
@@ -156,6 +160,7 @@ class Part:
 
     help: str
     needs: tuple[str, ...]
+    unit: str = ""
 
     def normalise(self, name: str, value: Any) -> Any:
         missing = [attribute for attribute in self.needs if not hasattr(value, attribute)]
@@ -164,7 +169,45 @@ class Part:
         return value
 
 
-Rule: TypeAlias = Number | Matrix | Part
+@dataclasses.dataclass(frozen=True)
+class Count:
+    """Declaration of a field that holds a whole number."""
+
+    help: str
+    at_least: int = 0
+    at_most: float = 10_000_000  # beyond it what is counted would not fit in memory
+    unit: str = ""
+
+    def allowed(self) -> str:
+        """Returns the range in words."""
+        most = f" and at most {self.at_most}" if self.at_most < math.inf else ""
+        return f"a whole number, at least {self.at_least}{most}"
+
+    def normalise(self, name: str, value: Any) -> Any:
+        if isinstance(value, bool) or not isinstance(value, int) or not self.at_least <= value <= self.at_most:
+            raise InputError(name, value, self.allowed())
+        return value
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Declaration of a field that holds one of several words."""
+
+    help: str
+    options: tuple[str, ...]
+    unit: str = ""
+
+    def allowed(self) -> str:
+        """Returns the words."""
+        return "one of " + ", ".join(self.options)
+
+    def normalise(self, name: str, value: Any) -> Any:
+        if not isinstance(value, str) or value not in self.options:
+            raise InputError(name, value, self.allowed())
+        return value
+
+
+Rule: TypeAlias = Number | Matrix | Part | Count | Choice
 
 
 def number(unit: str, help: str, *, default: Any = dataclasses.MISSING, **more: Any) -> Any:
@@ -183,6 +226,76 @@ def part(help: str, *needs: str, default: Any = dataclasses.MISSING, default_fac
     if default_factory is not dataclasses.MISSING:
         return dataclasses.field(default_factory=default_factory, metadata=rule)
     return dataclasses.field(default=default, metadata=rule)
+
+
+def count(help: str, *, default: int, **more: Any) -> Any:
+    """Declares a field that holds a whole number; `more` are the remaining attributes of `Count`."""
+    return dataclasses.field(default=default, metadata={RULE: Count(help, **more)})
+
+
+def choice(help: str, options: tuple[str, ...], *, default: str) -> Any:
+    """Declares a field that holds one of the words `options`."""
+    return dataclasses.field(default=default, metadata={RULE: Choice(help, options)})
+
+
+def normalise_fields(component: Any, prefix: str = "") -> None:
+    """Checks the declared fields of a frozen dataclass and normalises their values in place.
+
+    Args:
+      component: the dataclass's instance, during its construction.
+      prefix: of the fields' names in error messages.
+
+    Raises:
+      InputError: a value outside its declared range.
+    """
+    for name, rule in rules(type(component)).items():
+        object.__setattr__(component, name, rule.normalise(prefix + name, getattr(component, name)))
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(number, count, choice, dataclasses.field))
+def config(cls: type[T]) -> type[T]:
+    """Makes a class a frozen dataclass whose declared fields are checked; its docstring lists them.
+
+    Raises (from the constructor):
+      InputError: a value outside its declared range.
+    """
+    own_check = getattr(cls, "__post_init__", None)
+
+    def post_init(self: Any) -> None:
+        normalise_fields(self)
+        if own_check is not None:
+            own_check(self)
+
+    cls.__post_init__ = post_init  # type: ignore[attr-defined]  # mypy does not see attributes added to a class
+    made: Any = dataclasses.dataclass(frozen=True)(cls)
+    lines = [f"  {name}: {r.help}{f' [{r.unit}]' if r.unit else ''}." for name, r in rules(made).items()]
+    made.__doc__ = "\n".join([inspect.cleandoc(made.__doc__), "", "Attributes:", *lines])
+    checked: type[T] = made
+    return checked
+
+
+def renamed(**names: str) -> Callable[[type[T]], type[T]]:
+    """Makes a dataclass accept old names of fields, given as old="new", for one release; it warns.
+
+    The command line's options and the files' keys accept them too.
+    """
+
+    def accept(cls: type[T]) -> type[T]:
+        make = cls.__init__
+
+        @functools.wraps(make)
+        def init(self: Any, *values: Any, **given: Any) -> None:
+            for old in names.keys() & given.keys():
+                message = f"{cls.__name__}.{old} is now {names[old]}; the old name goes with version 0.3"
+                warnings.warn(message, DeprecationWarning, stacklevel=2)
+                given[names[old]] = given.pop(old)
+            make(self, *values, **given)
+
+        cls.__init__ = init  # type: ignore[method-assign]  # wrapped on purpose
+        cls.RENAMED = names  # type: ignore[attr-defined]  # mypy does not see attributes added to a class
+        return cls
+
+    return accept
 
 
 def rules(cls: type) -> dict[str, Rule]:

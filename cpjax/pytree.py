@@ -24,6 +24,7 @@ from cpjax.fields import (
     fits,
     is_traced,
     matrix,
+    normalise_fields,
     number,
     numbers,
     part,
@@ -65,8 +66,7 @@ def pytree(cls: type[T]) -> type[T]:
     own_check = getattr(cls, "__post_init__", None)
 
     def post_init(self: Any) -> None:
-        for name, rule in rules(cls).items():
-            object.__setattr__(self, name, rule.normalise(f"{cls.__name__}.{name}", getattr(self, name)))
+        normalise_fields(self, f"{cls.__name__}.")
         if own_check is not None:
             own_check(self)
 

@@ -28,7 +28,8 @@ from cpjax import (
     paper,
     rollout,
 )
-from cpjax.pytree import number, pytree
+from cpjax.fields import choice, config, count, number, renamed
+from cpjax.pytree import pytree
 
 PLANT = CartPole(
     pole_inertia=0.02, cart_friction=0.1, pivot_friction=0.01, motor=Motor(resistance=1.5, voltage_limit=math.inf)
@@ -333,3 +334,34 @@ def test_the_own_check_of_a_class_runs_after_the_declared_ones():
         _Limited(-1.0)
     with pytest.raises(InputError, match=r"at most 2 in all"):
         _Limited(3.0)
+
+
+def test_a_config_checks_its_fields_and_lists_them_in_its_docstring():
+    @config
+    class Run:
+        """Sizes of a run."""
+
+        starts: int = count("initial states", default=4, at_least=1)
+        step: float = number("s", "of the integrator", default=0.1, above=0.0)
+        law: str = choice("swing-up law", ("energy", "bang"), default="energy")
+
+    assert Run(step=1).step == 1.0
+    assert Run.__doc__.endswith("  starts: initial states.\n  step: of the integrator [s].\n  law: swing-up law.")
+    for given, field in (({"starts": 0}, "starts"), ({"starts": True}, "starts"), ({"law": "none"}, "law")):
+        with pytest.raises(InputError) as caught:
+            Run(**given)
+        assert caught.value.field == field
+
+
+def test_an_old_name_of_a_field_works_and_warns():
+    @renamed(h="step")
+    @config
+    class Run:
+        """Sizes of a run."""
+
+        step: float = number("s", "of the integrator", default=0.1, above=0.0)
+
+    with pytest.warns(DeprecationWarning, match="Run.h is now step"):
+        assert Run(h=0.5).step == 0.5
+    with pytest.raises(TypeError):
+        Run(g=0.5)

@@ -47,7 +47,7 @@ def run(given: argparse.Namespace) -> int:
     controller = build_hybrid(sections["controller"], plant)
     notes = notes_on(sections["plant"], plant, {"the controller": controller})
     announce("audit-gradients", notes)
-    audit = audited(given.out, plant, controller, sections["audit"], given.seed, notes)
+    audit = run_audit(given.out, plant, controller, sections["audit"], given.seed, notes)
 
     from cpjax.show.gradients import TITLE, cells, findings, header
 
@@ -62,7 +62,7 @@ def run(given: argparse.Namespace) -> int:
     return 0
 
 
-def audited(
+def run_audit(
     out: Path, plant: CartPole, controller: Hybrid, setting: Mapping[str, Any], seed: int, notes: Sequence[str] = ()
 ) -> GradientAudit:
     """Runs the audit and writes its JSON and picture.

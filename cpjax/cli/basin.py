@@ -86,7 +86,7 @@ def run(given: argparse.Namespace) -> int:
     setting = {"duration": 10.0, "dt": 0.002, **sections["run"]}
     begin = time.perf_counter()
     chart = chart_of(chosen, given.seed)
-    rows = drawn(given.out, given.out / "basin.parts", plant, controllers, chart, setting, notes)
+    rows = run_basin(given.out, given.out / "basin.parts", plant, controllers, chart, setting, notes)
     seconds = time.perf_counter() - begin
     print_table(*table(rows), text_columns=1)
     steps = len(names) * chart.up.cells * chart.across.cells * round(setting["duration"] / setting["dt"])
@@ -95,7 +95,7 @@ def run(given: argparse.Namespace) -> int:
     return 0
 
 
-def drawn(
+def run_basin(
     out: Path,
     parts: Path,
     plant: CartPole,
@@ -127,7 +127,7 @@ def drawn(
         "controllers": {name: io.encode(one) for name, one in controllers.items()},
     }
     with Workspace(parts, request) as memory:
-        metrics = {name: mapped(memory, plant, chart, name, one, setting) for name, one in controllers.items()}
+        metrics = {name: compute_map(memory, plant, chart, name, one, setting) for name, one in controllers.items()}
         rows = {name: document(chart, found) for name, found in metrics.items()}
 
         from cpjax.show.basin import basins
@@ -174,7 +174,7 @@ def file_of(name: str) -> str:
     return name.replace("/", "-").removesuffix(".json").removesuffix(".toml").lstrip(".-") + ".npz"
 
 
-def mapped(
+def compute_map(
     memory: Workspace, plant: CartPole, chart: StartGrid, name: str, controller: Hybrid, setting: dict[str, Any]
 ) -> Metrics:
     """Returns the metrics of a controller's map, recorded in `memory` or, if complete there, read from it."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from cpjax import io, paper
 from cpjax.cli.notes import papers_own
-from cpjax.cli.options import Option, numbers_of
+from cpjax.cli.options import Option, options_of
 from cpjax.controllers import (
     AngleGate,
     AngleRateGate,
@@ -47,8 +47,8 @@ _GATES: Mapping[str, type[AngleGate | AngleRateGate | LyapunovGate]] = {
 
 PLANT_OPTIONS = [
     Option("plant", "base", f"{_PLANTS}, or a plant's file; other options change it (default appendix)", flag="plant"),
-    *numbers_of("plant", CartPole),
-    *numbers_of("plant", Motor),
+    *options_of("plant", CartPole),
+    *options_of("plant", Motor),
 ]
 
 CONTROLLER_OPTIONS = [
@@ -77,15 +77,15 @@ CONTROLLER_OPTIONS = [
     Option("controller", "R", "and the weight of the voltage (default the paper's 1e-4)", float, flag="r"),
     Option("controller", "poles", "placement for the plant: poles, such as -3 -4 -5+2j -5-2j", count=4, numbers=True),
     Option("controller", "K", "the regulator's gain itself, instead of all these", float, count=4, flag="gain"),
-    *numbers_of("controller", EnergySwingUp),
+    *options_of("controller", EnergySwingUp),
     Option(
         "controller",
         "gate",
         "where the regulator takes over (default angle); lyapunov: a level set of the LQR of q, r; needs --level",
         choices=tuple(_GATES),
     ),
-    *numbers_of("controller", AngleRateGate),
-    *numbers_of("controller", LyapunovGate, ["level"]),
+    *options_of("controller", AngleRateGate),
+    *options_of("controller", LyapunovGate, ["level"]),
     Option("controller", "reference_x", "where the cart is to be held (default 0) [m]", float),
 ]
 

@@ -52,7 +52,7 @@ def run(given: argparse.Namespace) -> int:
     tuned = {design: _loaded(design, files[design]) for design in DESIGNS if design in files}
     notes = notes_on(sections["plant"], plant, {_name(one): one.controller for one in entries(plant, tuned)})
     announce("compare", notes)
-    results, shown_start = compared(given.out, plant, setting, tuned, limit, notes)
+    results, shown_start = run_comparison(given.out, plant, setting, tuned, limit, notes)
 
     from cpjax.show.comparison import findings
 
@@ -62,7 +62,7 @@ def run(given: argparse.Namespace) -> int:
     return 0
 
 
-def compared(
+def run_comparison(
     out: Path,
     plant: CartPole,
     setting: EvaluationConfig,

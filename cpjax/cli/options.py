@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeAlias
 
 from cpjax import files
 from cpjax.errors import InputError
-from cpjax.pytree import Number, rules
+from cpjax.fields import Choice, Count, Number, rules
 
 Sections: TypeAlias = Mapping[str, Mapping[str, Any]]
 """Values given by the user, by section and key. Those not given are absent."""
@@ -33,6 +33,8 @@ class Option:
     flag: str | None = None
     numbers: bool = False
     """Whether a file may give a text as a number, or as a pair of real and imaginary part."""
+    old: str | None = None
+    """The key until the last release, which works for one more."""
 
     @property
     def name(self) -> str:
@@ -40,10 +42,30 @@ class Option:
         return "--" + (self.flag or self.key.replace("_", "-"))
 
 
-def numbers_of(section: str, cls: type, keys: Sequence[str] | None = None) -> list[Option]:
-    """Returns an option for each number of a class, or for those named in `keys`."""
-    chosen = {k: r for k, r in rules(cls).items() if isinstance(r, Number) and (keys is None or k in keys)}
-    return [Option(section, key, f"{rule.help} [{rule.unit}]", float) for key, rule in chosen.items()]
+def options_of(section: str, cls: type, keys: Sequence[str] | None = None, *, defaults: bool = False) -> list[Option]:
+    """Returns an option for each declared number or word of a class.
+
+    Args:
+      section: the options' section.
+      cls: a class whose fields are declared (see `cpjax.fields`).
+      keys: the fields to take; None for all.
+      defaults: whether the help texts name the class's defaults.
+    """
+    types = {Number: float, Count: int, Choice: str}
+    values = {field.name: field.default for field in dataclasses.fields(cls)}
+    old = {new: name for name, new in getattr(cls, "RENAMED", {}).items()}
+    return [
+        Option(
+            section,
+            key,
+            " ".join([rule.help, f"[{rule.unit}]" * bool(rule.unit), f"(default {values[key]})" * defaults]),
+            types[type(rule)],
+            choices=rule.options if isinstance(rule, Choice) else None,
+            old=old.get(key),
+        )
+        for key, rule in rules(cls).items()
+        if isinstance(rule, Number | Count | Choice) and (keys is None or key in keys)
+    ]
 
 
 def add_options(parser: argparse.ArgumentParser, options: Sequence[Option], *, out: str) -> None:
@@ -60,6 +82,7 @@ def add_options(parser: argparse.ArgumentParser, options: Sequence[Option], *, o
         for option in (o for o in options if o.section == section):
             group.add_argument(
                 option.name,
+                *(["--" + option.old.replace("_", "-")] if option.old else []),
                 dest=f"{option.section}.{option.key}",
                 type=option.type,
                 choices=option.choices,
@@ -107,7 +130,7 @@ def _counted(count: int | tuple[int, int] | Literal["+"] | None) -> str:
 def _read_config(path: Path, options: Sequence[Option], sections: dict[str, dict[str, Any]]) -> None:
     if path.suffix.lower() != ".toml":
         raise InputError("--config", str(path), "a TOML file, with a name that ends in .toml")
-    known = {(option.section, option.key): option for option in options}
+    known = {(option.section, key): option for option in options for key in (option.key, option.old) if key}
     for section, table in files.read_table(path).items():
         if section not in sections:
             raise InputError(f"{path}: section", section, "one of " + ", ".join(sections))
@@ -118,7 +141,7 @@ def _read_config(path: Path, options: Sequence[Option], sections: dict[str, dict
             if option is None:
                 keys = ", ".join(k for s, k in known if s == section)
                 raise InputError(f"{path}: [{section}] key", key, f"one of {keys}")
-            sections[section][key] = _checked_value(f"{path}: [{section}] {key}", value, option)
+            sections[section][option.key] = _checked_value(f"{path}: [{section}] {key}", value, option)
 
 
 def _checked_value(field: str, value: Any, option: Option) -> Any:

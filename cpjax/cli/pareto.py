@@ -11,7 +11,7 @@ import numpy as np
 from cpjax import files, io, paper
 from cpjax.cli.builders import PLANT_OPTIONS, build_plant
 from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import Option, add_options, resolve
+from cpjax.cli.options import Option, add_options, options_of, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
@@ -31,16 +31,8 @@ Found: TypeAlias = dict[paper.Design, dict[str, Any]]
 
 SUPPLIES = (6.0, 9.0, 24.0)
 _LOWEST_SUPPLY, _HIGHEST_SUPPLY = 0.01, 10_000.0
-_PLANNED = {
-    "bounds": "tunings with a bound for each cost and supply, and one more without",
-    "candidates": "random controllers to begin with",
-    "steps": "of the optimiser",
-    "batch": "starts of a step",
-    "final": "starts that the points are measured from",
-}
-
 OPTIONS = [
-    *(Option("front", key, f"{text} (default {getattr(FrontConfig, key)})", int) for key, text in _PLANNED.items()),
+    *options_of("front", FrontConfig, ["bounds", "candidates", "steps", "batch", "final"], defaults=True),
     Option(
         "front",
         "supplies",
@@ -79,7 +71,7 @@ def run(given: argparse.Namespace) -> int:
     plan = FrontConfig(seed=given.seed, **chosen)
     notes = notes_on(sections["plant"], plant)
     announce("pareto", notes)
-    found = made(given.out, given.out / "pareto.parts", plant, plan, supplies, notes)
+    found = run_pareto(given.out, given.out / "pareto.parts", plant, plan, supplies, notes)
     print_table(*table(found), text_columns=2)
     from cpjax.show.front import findings
 
@@ -88,7 +80,7 @@ def run(given: argparse.Namespace) -> int:
     return 0
 
 
-def made(
+def run_pareto(
     out: Path, parts: Path, plant: CartPole, plan: FrontConfig, supplies: tuple[float, ...], notes: Sequence[str] = ()
 ) -> Found:
     """Traces the fronts of both designs and writes pareto.json, pareto.png and supplies.png.
@@ -103,7 +95,7 @@ def made(
     request = {"plan": dataclasses.asdict(plan), "plant": io.encode(plant), "supplies": supplies}
     with Workspace(parts, {**request, "versions": files.versions()}) as memory:
         measure = reference_points(plant, plan, supplies)
-        found = {design: traced(memory, plant, design, plan, supplies, measure) for design in DESIGNS}
+        found = {design: trace_design(memory, plant, design, plan, supplies, measure) for design in DESIGNS}
         known = known_controllers(plant, plan)
         document = {
             "what": "mean settling time against mean cost, of controllers that no other found beats",
@@ -134,7 +126,7 @@ def known_controllers(plant: CartPole, plan: FrontConfig) -> list[tuple[str, Com
     return [(preset if one.entry.gains == "tuned" else one.entry.name, one) for one in compared]
 
 
-def traced(
+def trace_design(
     memory: Workspace,
     plant: CartPole,
     design: paper.Design,
@@ -164,7 +156,7 @@ def traced(
         {
             "supply": supply,
             "cost": cost,
-            "bland": measure.baseline[design][supply, cost].tolist(),
+            "baseline": measure.baseline[design][supply, cost].tolist(),
             "reference": measure.reference[supply, cost].tolist(),
             **{
                 kind: {
@@ -205,7 +197,7 @@ def draw(out: Path, plant: CartPole, found: Found, controllers: list[tuple[str, 
     for design in DESIGNS:
         for row in found[design]["rows"]:
             if row["supply"] == own:
-                baseline[row["cost"]][design] = np.asarray(row["bland"], float)
+                baseline[row["cost"]][design] = np.asarray(row["baseline"], float)
     supplies = {supply: designs for (supply, cost), designs in curves.items() if cost == "effort"}
     of_all_costs = png(fronts({cost: curves[own, cost] for cost in COSTS}, baseline, known))
     files.write_bytes(out / "supplies.png", png(by_supply(supplies)))

@@ -49,13 +49,13 @@ def run(given: argparse.Namespace) -> int:
     asked = {"setting": dataclasses.asdict(setting), "cells": per_axis, "studies": studies}
     asked["versions"] = files.versions()
     with Workspace(given.out / "report.parts", asked) as memory:
-        rows = written(given, memory.folder, setting, per_axis, studies)
+        rows = write_report(given, memory.folder, setting, per_axis, studies)
     print_rows(rows)
     say(f"wrote {given.out / 'report.html'}")
     return 0
 
 
-def written(
+def write_report(
     given: argparse.Namespace, parts: Path, setting: EvaluationConfig, per_axis: int, studies: str
 ) -> list[dict[str, Any]]:
     """Runs the reproduction and all studies, writes the page and its files, and returns the reproduction's rows.
@@ -69,13 +69,13 @@ def written(
     rows = rows_of(given.out, parts / "reproduction", setting)
 
     from cpjax.cli import report_sections as sections_of  # matplotlib is slow; bad input should fail before
-    from cpjax.cli.compare import compared
+    from cpjax.cli.compare import run_comparison
     from cpjax.show import comparison
     from cpjax.show.figures import save_figure, success_rates
     from cpjax.show.page import Page
     from cpjax.show.reproduction import HEADER, cells, findings, pictures
 
-    results, shown_start = compared(given.out, paper.appendix_plant(), setting, {})
+    results, shown_start = run_comparison(given.out, paper.appendix_plant(), setting, {})
     page = Page(
         "Swing-up at 12 volts",
         "A student paper swings a pendulum up with an energy law and catches it with LQR or pole placement: here are "

@@ -8,10 +8,10 @@ from typing import Any, get_args
 from cpjax import files, paper
 from cpjax.cli import basin, pareto
 from cpjax.cli.animate import animated, verdict
-from cpjax.cli.audit_gradients import audited
+from cpjax.cli.audit_gradients import run_audit
 from cpjax.cli.builders import controller_title, named_hybrid
 from cpjax.cli.progress import progress
-from cpjax.cli.tune import tuned
+from cpjax.cli.tune import run_tuning
 from cpjax.controllers import AngleGate
 from cpjax.paper.comparison import Compared
 from cpjax.paper.gain_identification import audit_gains, write
@@ -36,8 +36,8 @@ QUICK_FRONTS: Mapping[str, Any] = {
     "bounds": 11,
     "candidates": 2048,
     "steps": 40,
-    "judge_every": 4,
-    "semifinal": 128,
+    "evaluate_every": 4,
+    "reevaluation": 128,
     "final": 256,
 }
 """Fields of a `FrontConfig`."""
@@ -100,7 +100,7 @@ def forensics(page: Page, given: argparse.Namespace) -> None:
 def gradients(page: Page, given: argparse.Namespace, size: str) -> None:
     """Adds the section on which gradients through the switch can be trusted; `size` is quick or full."""
     plant = paper.appendix_plant()
-    audit = audited(given.out, plant, preset("lqr"), QUICK_AUDIT if size == "quick" else {}, given.seed)
+    audit = run_audit(given.out, plant, preset("lqr"), QUICK_AUDIT if size == "quick" else {}, given.seed)
 
     page.section("Can the gradients be trusted?")
     page.text(
@@ -137,7 +137,7 @@ def tuning(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
         plan = TuningConfig(seed=given.seed, **(QUICK_TUNING if size == "quick" else {}))
         free = free_parameters(baseline(design, plant))
         folder = given.out / f"tune-{design}"
-        found = tuned(folder, plant, free, plan, parts / f"tune-{design}.npz")
+        found = run_tuning(folder, plant, free, plan, parts / f"tune-{design}.npz")
         page.picture(
             (folder / "tune.png").read_bytes(),
             f"{DESIGN_NAMES[design]}: settling time and share of starts of each restart (grey), and of the one that is "
@@ -216,7 +216,7 @@ def basins(page: Page, given: argparse.Namespace, parts: Path, cells: int) -> No
     controllers = {name: named_hybrid(name, plant) for name in basin.CONTROLLERS}
     chart = basin.chart_of({"cells": cells}, given.seed)
     _, header, rows = basin.table(
-        basin.drawn(given.out, parts / "basin", plant, controllers, chart, {"duration": 10.0, "dt": 0.002})
+        basin.run_basin(given.out, parts / "basin", plant, controllers, chart, {"duration": 10.0, "dt": 0.002})
     )
     page.section("Basins of attraction")
     page.text(
@@ -240,7 +240,7 @@ def fronts(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
       size: quick (few steps, the plant's own supply) or full.
     """
     plan = FrontConfig(seed=given.seed, **(QUICK_FRONTS if size == "quick" else {}))
-    found = pareto.made(
+    found = pareto.run_pareto(
         given.out, parts / "pareto", paper.appendix_plant(), plan, () if size == "quick" else pareto.SUPPLIES
     )
     page.section("Settling time against cost")

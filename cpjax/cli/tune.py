@@ -1,7 +1,6 @@
 """`cpjax tune`: a controller tuned by gradients through swing-ups, as a file for `--controller` of other commands."""
 
 import argparse
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -11,7 +10,7 @@ import numpy as np
 from cpjax import files, io
 from cpjax.cli.builders import PLANT_OPTIONS, build_plant, saved
 from cpjax.cli.notes import announce, notes_on
-from cpjax.cli.options import Option, add_options, numbers_of, resolve
+from cpjax.cli.options import Option, add_options, options_of, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import compiling, progress
 from cpjax.cli.tables import print_table
@@ -19,44 +18,14 @@ from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
 from cpjax.paper.initial import initial_controller
 from cpjax.plant import CartPole
-from cpjax.plant.initial_states import START_SETS
 from cpjax.tune.baseline import GateKind
-from cpjax.tune.config import AGGREGATES, TuningConfig
+from cpjax.tune.config import TuningConfig
 from cpjax.tune.objective import Goal
 from cpjax.tune.parameters import FreeParameters, free_parameters
 
 if TYPE_CHECKING:  # imports optax, which is slow
     from cpjax.tune.outcome import Tuning
 
-_DEFAULTS = {field.name: field.default for field in dataclasses.fields(TuningConfig)}
-_PLANNED = {
-    "candidates": "random controllers to choose restarts from",
-    "restarts": "controllers that are tuned side by side",
-    "batch": "starts of a step",
-    "resample": "steps after which these are drawn anew; 0 to keep the first ones",
-    "steps": "of the optimiser",
-    "learning_rate": "Adam's, at first",
-    "duration": "of the tuning's rollouts [s]",
-    "dt": "their step [s]",
-    "first_width": "of the target, at first [rad and m]",
-    "last_width": "of the target, in the end [rad and m]",
-    "spare_rate": "steps beyond those in each second, for crossings [1/s]",
-    "temperature": "of a soft maximum or a success-weighted mean [s]",
-    "threshold": "of a success-weighted mean [s]",
-    "tail": "share of the worst starts that the mean is taken over",
-    "explore": "noise when the worse half of the restarts goes on from the better",
-    "clip": "a start's gradient is norm-clipped to this many times the batch's median norm",
-    "screening": "starts by which all candidates are compared",
-    "validation": "starts of a validation",
-    "validate_every": "steps between validations",
-    "horizon": "of screening and validation [s]",
-    "horizon_dt": "their step and control period [s]",
-    "finalists": "restarts that are compared once more in the end",
-    "final": "starts of that comparison",
-    "pole_limit": "bound on the fastest closed-loop pole [1/s]",
-    "patience": "validations without progress after which to end; 0 for never",
-    "plant_spread": "draw each start's plant within this share about the given one",
-}
 OPTIONS = [
     *PLANT_OPTIONS,
     Option("tune", "design", "of the regulator (default lqr)", choices=("lqr", "placement")),
@@ -65,13 +34,8 @@ OPTIONS = [
     Option("tune", "frozen", "parameters to leave as they are, with commas between"),
     Option("tune", "free", "the only parameters to change, with commas between"),
     Option("tune", "full_q", "a full state weight (default diagonal)", choices=("full", "diagonal"), flag="q-shape"),
-    Option("tune", "starts", "set of starts (default hanging)", choices=START_SETS),
-    Option("tune", "aggregate", "of a batch's starts (default tail, a mean)", choices=AGGREGATES),
-    *(
-        Option("tune", name, f"{text} (default {_DEFAULTS[name]:g})", type(_DEFAULTS[name]))
-        for name, text in _PLANNED.items()
-    ),
-    *numbers_of("goal", Goal),
+    *(option for option in options_of("tune", TuningConfig, defaults=True) if option.key != "seed"),
+    *options_of("goal", Goal, defaults=True),
 ]
 
 
@@ -99,7 +63,7 @@ def run(given: argparse.Namespace) -> int:
     names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}
     free = free_parameters(controller, **names, full_q=setting.pop("full_q", "diagonal") == "full")
     plan = TuningConfig(seed=given.seed, goal=Goal(**sections["goal"]), **setting)
-    tuning = tuned(given.out, plant, free, plan, given.out / "checkpoint.npz", notes)
+    tuning = run_tuning(given.out, plant, free, plan, given.out / "checkpoint.npz", notes)
     before = np.asarray(free.physical(free.start()))
     rows = [(label, f"{a:.4g}", f"{b:.4g}") for label, a, b in zip(tuning.labels, before, tuning.physical, strict=True)]
     print_table("Parameters, SI units", ("parameter", "start", "tuned"), rows, text_columns=1)
@@ -112,7 +76,7 @@ def run(given: argparse.Namespace) -> int:
     return 0 if tuning.success_rate > 0.0 else 1
 
 
-def tuned(
+def run_tuning(
     out: Path, plant: CartPole, free: FreeParameters, plan: TuningConfig, checkpoint: Path, notes: Sequence[str] = ()
 ) -> "Tuning":
     """Runs the tuning and writes tuned.json, tune.json and tune.png.

@@ -27,7 +27,7 @@ EXPLAINED = 1.0
 """Worst residual, in units of the last digit, up to which gains count as explained: two roundings leave up to 1.0."""
 
 _STEPS = 40
-_LANES = 512  # batch size: fits that run at once
+_BATCH = 512  # batch size: fits that run at once
 _START_FACTOR = 3.0
 Progress: TypeAlias = Callable[[int, int, str], None]
 
@@ -139,13 +139,13 @@ def fit_all(
     padded = [[*map(PARAMETERS.index, names), *[len(PARAMETERS)] * (most - len(names))] for names in sets]
     chosen, x = np.repeat(padded, count, axis=0), starts.reshape(-1, most)
     base = jnp.asarray([scale_of(plant, name) for name in PARAMETERS])
-    lanes = min(_LANES, len(x))
+    size = min(_BATCH, len(x))
     ends = []
-    for first in range(0, len(x), lanes):
+    for first in range(0, len(x), size):
         if progress is not None:
             text = f"sets of up to {most} parameters, {count} starts each"
             progress(first // count, len(sets), text)
-        now = np.arange(first, first + lanes) % len(x)  # surplus elements of the last batch are dropped below
+        now = np.arange(first, first + size) % len(x)  # surplus elements of the last batch are dropped below
         ends.append(_fitted(prints, *_numbers(plant), base, chosen[now], jnp.asarray(x[now])))
     found, rest = (np.concatenate(a)[: len(x)].reshape(len(sets), count, -1) for a in zip(*ends, strict=True))
     cost = np.sum(rest**2, axis=-1)

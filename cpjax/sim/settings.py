@@ -165,6 +165,23 @@ def check_settings(
     )
 
 
+def check_whole_steps(config: Any, *pairs: tuple[str, str]) -> None:
+    """Checks durations and steps of a config.
+
+    Args:
+      pairs: names of a duration's field and of the field of the step that must divide it.
+
+    Raises:
+      InputError: a duration that is no whole number of steps, by the name of its field.
+    """
+    for whole, step in pairs:
+        try:
+            check_settings(duration=getattr(config, whole), dt=getattr(config, step))
+        except InputError as problem:
+            field = step if problem.field == "dt" else whole
+            raise InputError(field, getattr(config, field), problem.allowed) from problem
+
+
 def _check_choice(field: str, value: Any, choices: Any) -> None:
     if value is not None and (not isinstance(value, str) or value not in get_args(choices)):
         raise InputError(field, value, " or ".join(get_args(choices)))

@@ -211,9 +211,9 @@ def prepare(
     columns = jax.tree.leaves(starts)
     total, dtype = columns[0].shape[0], columns[0].dtype
     devices = jax.devices()
-    lanes, size = _sizes(total, devices, settings, np.dtype(dtype).itemsize, chunk, block)
+    chunk_length, size = _sizes(total, devices, settings, np.dtype(dtype).itemsize, chunk, block)
     mesh = Mesh(np.array(devices), (_AXIS,))
-    kind = _CompileKey(structure, (True,) * len(columns) + tuple(batched), settings, lanes, mesh)
+    kind = _CompileKey(structure, (True,) * len(columns) + tuple(batched), settings, chunk_length, mesh)
     return SweepPlan(kind, leaves, total, size)
 
 

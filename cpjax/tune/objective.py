@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from cpjax.backend.extremes import fast_maximum
 from cpjax.errors import InputError
+from cpjax.fields import renamed
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, number, part, pytree
@@ -182,25 +183,26 @@ class WeightedSum(_Several):
 class Lagrangian(_Several):
     """Lagrangian of the time outside the target under bounds on the mean costs [s]; and the costs themselves.
 
-    The Lagrangian is time + remaining (1 + fine) + sum(price cost), with multipliers `prices` and the time `remaining`
+    The Lagrangian is time + remaining (1 + stop_penalty) + sum(multiplier cost), with the time `remaining`
     when the run is stopped early.
     """
 
     terms: tuple[Any, ...]
     """Metrics: the time outside the target, the costs, and the remaining time of a stopped run."""
-    prices: tuple[Any, ...]
+    multipliers: tuple[Any, ...]
     """Multiplier of each cost [s per unit of the cost]."""
-    fine: Any
+    stop_penalty: Any
     """Extra weight of each second lost when a run stops early [1]."""
 
     def finish(self, memory: tuple[Any, ...], last: Sample) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         time, *costs, undone = self._results(memory, last)
-        total = time + undone * (1.0 + self.fine)
-        for price, cost in zip(self.prices, costs, strict=True):
-            total = total + price * cost
+        total = time + undone * (1.0 + self.stop_penalty)
+        for multiplier, cost in zip(self.multipliers, costs, strict=True):
+            total = total + multiplier * cost
         return total, tuple(costs)
 
 
+@renamed(jerkiness="voltage_variation")
 @pytree
 class Goal:
     """Weights of the objective, whose unit is the second. Terms of weight 0 are not computed."""
@@ -209,7 +211,7 @@ class Goal:
     effort: Scalar = number("s/(V^2 s)", "of the integral of u^2", default=0.0, at_least=0.0)
     track: Scalar = number("1", "of the time beyond the track's limit", default=0.0, at_least=0.0)
     track_limit: Scalar = number("m", "of the track", default=math.inf, above=0.0, infinite=True)
-    jerkiness: Scalar = number("s/V", "of the voltage's total variation", default=0.0, at_least=0.0)
+    voltage_variation: Scalar = number("s/V", "of the voltage's total variation", default=0.0, at_least=0.0)
     energy: Scalar = number("1", "of the time with the wrong energy", default=0.0, at_least=0.0)
     terminal: Scalar = number("s", "of the distance at the end", default=0.0, at_least=0.0)
 
@@ -235,7 +237,7 @@ class Goal:
             "time": lambda: TimeOutside(width, width),
             "effort": Effort,
             "track": lambda: TrackExcess(limit, 0.1 * limit),
-            "jerkiness": VoltageVariation,
+            "voltage_variation": VoltageVariation,
             "energy": lambda: EnergyError(plant),
             "terminal": lambda: TerminalCost(width, width),
         }
@@ -246,7 +248,7 @@ class Goal:
         return WeightedSum(terms, (*(float(getattr(self, name)) for name in chosen), worst))
 
 
-WEIGHTS = ("time", "effort", "track", "jerkiness", "energy", "terminal")
+WEIGHTS = ("time", "effort", "track", "voltage_variation", "energy", "terminal")
 """Names of the weights of a `Goal`."""
 
 

@@ -36,7 +36,7 @@ Numbers = np.ndarray[Any, Any]
 Report = Callable[[int, int, str], None]
 
 _FAILURE = 30.0  # settling time that a failed run counts as, in horizons: success comes before time
-_SCREEN, _STEP, _VALIDATE, _SEMIFINAL, _FINAL, _CANDIDATES, _NOISE = range(7)  # purposes of random numbers
+_SCREEN, _STEP, _VALIDATE, _COMPARISON, _FINAL, _CANDIDATES, _NOISE = range(7)  # purposes of random numbers
 _BLOCK, _CONTROLLERS = 512, 64  # batch sizes: runs simulated, and controllers designed, at once
 
 
@@ -167,8 +167,8 @@ class _Tuner:
     def finish(self, memory: TunerState, began: float) -> Tuning:
         """Compares the best restarts on more initial states and returns the best of them."""
         plan = self.plan
-        semifinal, _, _ = self._score(memory.best, plan.final, _SEMIFINAL)
-        chosen = np.argsort(semifinal, kind="stable")[: plan.finalists]
+        compared, _, _ = self._score(memory.best, plan.final, _COMPARISON)
+        chosen = np.argsort(compared, kind="stable")[: plan.finalists]
         scores, rates, times = self._score(memory.best[chosen], plan.final, _FINAL)
         best = int(np.argmin(scores))
         vector = memory.best[chosen[best]]
@@ -182,7 +182,7 @@ class _Tuner:
             settling_time=float(times[best]),
             history=memory.history,
             value_steps=memory.value_steps
-            + len(semifinal) * self._value_steps(plan.final)
+            + len(compared) * self._value_steps(plan.final)
             + len(chosen) * self._value_steps(plan.final, final=True),
             gradient_steps=memory.gradient_steps,
             seconds=time.perf_counter() - began,
@@ -278,7 +278,7 @@ class _Tuner:
         runs = over(self.evaluated if final else self.validated, count)
         failure = _FAILURE * horizon * max(1.0, float(goal.time))
         cost = np.where(runs.success, goal.time * runs.settling_time, failure)
-        cost = cost + goal.effort * runs.effort + goal.jerkiness * runs.voltage_variation
+        cost = cost + goal.effort * runs.effort + goal.voltage_variation * runs.voltage_variation
         score = np.mean(cost, axis=1)
         if watched := _watched(count):
             # More crossings than can be located: the run slides along the gate's boundary, and would chatter on a rig.

@@ -869,7 +869,7 @@ def test_the_comparison_in_a_report_is_that_of_its_json(report):
 @pytest.mark.slow
 def test_the_studies_in_a_report_are_those_of_its_json(command, tmp_path, monkeypatch):
     monkeypatch.setattr(report_sections, "forensics", lambda page, given: None)
-    fronts = {"bounds": 2, "candidates": 64, "steps": 2, "semifinal": 16, "final": 16}
+    fronts = {"bounds": 2, "candidates": 64, "steps": 2, "reevaluation": 16, "final": 16}
     monkeypatch.setattr(report_sections, "QUICK_FRONTS", fronts)
     tuning = {"candidates": 15, "restarts": 2, "batch": 2, "steps": 2, "final": 64}
     monkeypatch.setattr(report_sections, "QUICK_TUNING", tuning)

@@ -15,7 +15,7 @@ from cpjax.sim.metrics import TimeOutside
 from cpjax.study.fronts.cache import Search, load_or_run
 from cpjax.study.fronts.config import COSTS, FrontConfig
 from cpjax.study.fronts.evaluator import Evaluated, nondominated_sort
-from cpjax.study.fronts.reference_point import lanes, reference_points
+from cpjax.study.fronts.reference_point import objectives, reference_points
 from cpjax.study.fronts.trace import FOLDS, GRADIENT_STEP, trace_fronts
 from cpjax.tune.baseline import baseline
 from cpjax.tune.objective import Lagrangian, RemainingTime, VoltageVariation
@@ -39,34 +39,34 @@ def test_the_time_that_is_minimised_has_every_cost_at_its_price():
     assert float(total) == pytest.approx(float(time + 0.01 * protocol.effort + 2.0 * protocol.cart_travel))
 
 
-def judged(rows):
+def evaluated(rows):
     success, time, effort = np.array(rows).T
     costs = np.stack([effort, np.ones(len(rows)), np.ones(len(rows))], axis=1)
     return Evaluated(np.arange(len(rows), dtype=float)[:, None], success, time, costs)
 
 
 def test_the_fastest_within_a_bound_never_fails_if_any_does_not():
-    met = judged([(1.0, 3.0, 10.0), (1.0, 2.0, 20.0), (0.9, 1.0, 5.0), (1.0, 4.0, 8.0)])
-    assert met.fastest("effort", 15.0, 0.99)[0] == 0.0
-    assert met.fastest("effort", 25.0, 0.99) == (1.0, 2.0)
-    assert met.fastest("effort", 25.0, 0.99, rank=1) == (0.0, 3.0)
-    assert met.fastest("effort", 25.0, 0.99, rank=9) == (3.0, 4.0)  # there are but three
-    vector, time = met.fastest("effort", 7.0, 0.99)
+    archive = evaluated([(1.0, 3.0, 10.0), (1.0, 2.0, 20.0), (0.9, 1.0, 5.0), (1.0, 4.0, 8.0)])
+    assert archive.fastest("effort", 15.0, 0.99)[0] == 0.0
+    assert archive.fastest("effort", 25.0, 0.99) == (1.0, 2.0)
+    assert archive.fastest("effort", 25.0, 0.99, rank=1) == (0.0, 3.0)
+    assert archive.fastest("effort", 25.0, 0.99, rank=9) == (3.0, 4.0)  # there are but three
+    vector, time = archive.fastest("effort", 7.0, 0.99)
     assert (vector, time) == (3.0, math.inf)  # none keeps to it: the cheapest of those that never fail
 
 
 def test_where_none_settles_enough_those_count_that_nearly_match_the_best():
-    met = judged([(0.6, 3.0, 10.0), (0.59, 2.0, 20.0), (0.3, 1.0, 5.0)])
-    assert met.fastest("effort", 100.0, 0.99) == (1.0, 2.0)
-    assert met.epsilon_grid("effort", FrontConfig(bounds=2)).tolist() == pytest.approx([8.5, 20.0, math.inf])
+    archive = evaluated([(0.6, 3.0, 10.0), (0.59, 2.0, 20.0), (0.3, 1.0, 5.0)])
+    assert archive.fastest("effort", 100.0, 0.99) == (1.0, 2.0)
+    assert archive.epsilon_grid("effort", FrontConfig(bounds=2)).tolist() == pytest.approx([8.5, 20.0, math.inf])
 
 
 @pytest.mark.slow
 def test_the_reference_is_the_same_for_both_designs_and_beyond_their_baselines():
     found = reference_points(PLANT, FrontConfig(final=64))
-    for lane in lanes(PLANT):
-        points = np.array([found.baseline[design][lane] for design in ("lqr", "placement")])
-        np.testing.assert_allclose(found.reference[lane], 1.1 * points.max(axis=0))
+    for objective in objectives(PLANT):
+        points = np.array([found.baseline[design][objective] for design in ("lqr", "placement")])
+        np.testing.assert_allclose(found.reference[objective], 1.1 * points.max(axis=0))
 
 
 @pytest.mark.slow
@@ -91,9 +91,9 @@ def test_layers_begin_with_what_no_other_beats_and_end_with_what_is_finite():
         ({"dt": -1.0}, "dt"),
         ({"lowest": 1.0}, "lowest"),
         ({"success": 1.5}, "success"),
-        ({"dearest": 0.5}, "dearest"),
+        ({"multiplier_range": 0.5}, "multiplier_range"),
         ({"lowest": 0.9995}, "lowest"),
-        ({"exchange_from": 0.0}, "exchange_from"),
+        ({"restart_from": 0.0}, "restart_from"),
         ({"spare_rate": 0.0}, "spare_rate"),
         ({"clip": math.inf}, "clip"),
         ({"explore": -0.1}, "explore"),
@@ -120,9 +120,9 @@ def test_the_sentences_say_of_each_design_what_either_search_found():
 
 
 def test_a_search_that_is_done_is_read_again_to_the_last_bit(tmp_path):
-    met = judged([(1.0, 1 / 3, 10.0), (0.5, math.inf, 20.0)])
+    archive = evaluated([(1.0, 1 / 3, 10.0), (0.5, math.inf, 20.0)])
     found = Search(
-        {12.0: met, 0.1: met._replace(time=met.time + 1.0)},
+        {12.0: archive, 0.1: archive._replace(time=archive.time + 1.0)},
         {12.0: 1, 0.1: 2},
         {12.0: 3, 0.1: 4},
         {12.0: 5, 0.1: 6},
@@ -132,16 +132,16 @@ def test_a_search_that_is_done_is_read_again_to_the_last_bit(tmp_path):
     assert load_or_run(memory, "search", lambda: found) is found
     again = load_or_run(memory, "search", lambda: pytest.fail("searched again"))
     assert again[1:] == found[1:]
-    assert list(again.met) == [12.0, 0.1]
-    for supply, one in found.met.items():
-        for kept, column in zip(again.met[supply], one, strict=True):
+    assert list(again.archive) == [12.0, 0.1]
+    for supply, one in found.archive.items():
+        for kept, column in zip(again.archive[supply], one, strict=True):
             np.testing.assert_array_equal(kept, column)
     assert load_or_run(None, "search", lambda: found) is found
 
 
 @pytest.mark.slow
 def test_a_small_front_is_made_of_controllers_that_do_what_its_points_say():
-    plan = FrontConfig(bounds=6, candidates=1024, steps=6, judge_every=3, semifinal=64, final=128, horizon=10.0)
+    plan = FrontConfig(bounds=6, candidates=1024, steps=6, evaluate_every=3, reevaluation=64, final=128, horizon=10.0)
     measure = reference_points(PLANT, plan, (24.0,))
     told = []
     found = trace_fronts(

@@ -40,7 +40,7 @@ def test_terms_are_the_integrals_they_say():
 
 @pytest.mark.slow
 def test_every_terms_gradient_is_its_difference():
-    goal = Goal(effort=0.01, track=1.0, track_limit=0.5, jerkiness=0.01, energy=0.5, terminal=1.0)
+    goal = Goal(effort=0.01, track=1.0, track_limit=0.5, voltage_variation=0.01, energy=0.5, terminal=1.0)
 
     @jax.jit
     @jax.value_and_grad

@@ -12,7 +12,7 @@ _COUNTS = ("begun", "values", "gradients")
 class Search(NamedTuple):
     """Result of a search, by supply [V]."""
 
-    met: Mapping[float, Evaluated]
+    archive: Mapping[float, Evaluated]
     """Archive of every controller that was evaluated by more than the screening."""
     begun: Mapping[float, int]
     """Number of those that came from the candidates."""
@@ -36,12 +36,14 @@ def load_or_run(memory: Workspace | None, name: str, search: Callable[[], Search
     if known is not None:
         columns, note = known
         supplies = note["supplies"]
-        met = {v: Evaluated(*(columns[f"{i}.{field}"] for field in Evaluated._fields)) for i, v in enumerate(supplies)}
+        rows = [Evaluated(*(columns[f"{i}.{field}"] for field in Evaluated._fields)) for i in range(len(supplies))]
+        archive = dict(zip(supplies, rows, strict=True))
         begun, values, gradients = (dict(zip(supplies, note[key], strict=True)) for key in _COUNTS)
-        return Search(met, begun, values, gradients, note["seconds"])
+        return Search(archive, begun, values, gradients, note["seconds"])
     found = search()
     if memory is not None:
-        columns = {f"{i}.{key}": of for i, one in enumerate(found.met.values()) for key, of in one._asdict().items()}
-        counts = {key: [getattr(found, key)[supply] for supply in found.met] for key in _COUNTS}
-        memory.save(name, columns, {"supplies": [*found.met], "seconds": found.seconds, **counts})
+        rows = list(found.archive.values())
+        columns = {f"{i}.{key}": column for i, row in enumerate(rows) for key, column in row._asdict().items()}
+        counts = {key: [getattr(found, key)[supply] for supply in found.archive] for key in _COUNTS}
+        memory.save(name, columns, {"supplies": [*found.archive], "seconds": found.seconds, **counts})
     return found

@@ -25,7 +25,7 @@ from cpjax.tune.parameters import FreeParameters, free_parameters
 
 Numbers = np.ndarray[Any, Any]
 
-SCREEN, BATCH, JUDGE, SEMIFINAL, FINAL, CANDIDATES, EXPLORE = range(7)
+SCREEN, BATCH, EVALUATION, REEVALUATION, FINAL, CANDIDATES, EXPLORE = range(7)
 """Purposes of random numbers."""
 
 _RUNS, _CONTROLLERS = 2048, 64  # batch sizes: runs simulated, and controllers designed, at once
@@ -49,7 +49,7 @@ class Evaluated(NamedTuple):
         found[self.success < success] = np.inf
         return found
 
-    def enough(self, wanted: float) -> float:
+    def threshold(self, wanted: float) -> float:
         """Returns the success threshold: `wanted` if any controller reaches it, else 97 % of the largest share."""
         best = float(np.max(self.success))
         return wanted if best >= wanted else 0.97 * best
@@ -62,13 +62,13 @@ class Evaluated(NamedTuple):
         Args:
           cost: one of `COSTS`.
           bound: largest mean cost.
-          success: wanted share of the initial states; see `enough`.
+          success: wanted share of the initial states; see `threshold`.
           rank: 0 for the best, 1 for the second, and so on; at most the last.
 
         Returns:
           Free parameters (d,) and mean settling time [s].
         """
-        time, spent = self.points(cost, self.enough(success)).T
+        time, spent = self.points(cost, self.threshold(success)).T
         within = np.flatnonzero((spent <= bound) & np.isfinite(time))
         worth = time if len(within) else spent
         among = within if len(within) else np.arange(len(spent))
@@ -77,7 +77,7 @@ class Evaluated(NamedTuple):
 
     def epsilon_grid(self, cost: str, plan: FrontConfig) -> Numbers:
         """Returns bounds on a cost (bounds + 1,), see `FrontConfig.bounds`; the last one is infinite."""
-        points = self.points(cost, self.enough(plan.success))
+        points = self.points(cost, self.threshold(plan.success))
         points = points[np.isfinite(points[:, 0])]
         if not len(points):
             return np.full(plan.bounds + 1, np.inf)
@@ -123,10 +123,10 @@ class Evaluator:
           vectors: free parameters (n, d).
           supply: voltage limit [V].
           count: number of initial states.
-          purpose: `SEMIFINAL` and `FINAL` use `final_dt`, others `judging_dt`; each has its own initial states.
+          purpose: `REEVALUATION` and `FINAL` use `final_dt`, others `evaluation_dt`; each has its own initial states.
         """
         plan, plant, starts = self._plan, self.plant_at(supply), self.starts(count, purpose)
-        dt = plan.final_dt if purpose in (SEMIFINAL, FINAL) else plan.judging_dt
+        dt = plan.final_dt if purpose in (REEVALUATION, FINAL) else plan.evaluation_dt
         controllers = in_blocks(self._built, _CONTROLLERS, vectors, np.full(len(vectors), supply, vectors.dtype))
 
         def run(which: Numbers, start: Numbers) -> Metrics:
@@ -172,9 +172,9 @@ class Evaluator:
         better: set[int] = {0}
         for cost in COSTS:
             better.update(
-                map(int, nondominated_sort(screened.points(cost, screened.enough(plan.success)), 4 * plan.bounds))
+                map(int, nondominated_sort(screened.points(cost, screened.threshold(plan.success)), 4 * plan.bounds))
             )
-        return self.evaluate(screened.vectors[sorted(better)], supply, plan.judging, JUDGE)
+        return self.evaluate(screened.vectors[sorted(better)], supply, plan.evaluation, EVALUATION)
 
 
 def nondominated_sort(points: Numbers, least: int) -> Numbers:

@@ -9,7 +9,7 @@ import numpy as np
 from cpjax.controllers import DesignName
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
-from cpjax.study.fronts.config import COSTS, FrontConfig, Lane
+from cpjax.study.fronts.config import COSTS, FrontConfig, Objective
 from cpjax.study.fronts.evaluator import FINAL, Evaluator
 
 Numbers = np.ndarray[Any, Any]
@@ -26,11 +26,11 @@ class ReferencePoints:
         there is none, the reference point at the plant's own supply.
     """
 
-    baseline: dict[DesignName, dict[Lane, Numbers]]
-    reference: dict[Lane, Numbers]
+    baseline: dict[DesignName, dict[Objective, Numbers]]
+    reference: dict[Objective, Numbers]
 
 
-def lanes(plant: CartPole, supplies: tuple[float, ...] = ()) -> list[Lane]:
+def objectives(plant: CartPole, supplies: tuple[float, ...] = ()) -> list[Objective]:
     """Returns the pairs that are traced: every cost at the plant's own supply, and effort at other supplies [V].
 
     Raises:
@@ -55,8 +55,8 @@ def reference_points(plant: CartPole, plan: FrontConfig, supplies: tuple[float, 
       InputError: a plant without a voltage limit, or on which no design's baseline controller settles from half of the
         initial states.
     """
-    wanted = lanes(plant, supplies)
-    baseline: dict[DesignName, dict[Lane, Numbers]] = {}
+    wanted = objectives(plant, supplies)
+    baseline: dict[DesignName, dict[Objective, Numbers]] = {}
     for design in get_args(DesignName):
         evaluator = Evaluator(plant, design, plan)
         start = np.asarray(evaluator.free.start())[None]
@@ -64,17 +64,17 @@ def reference_points(plant: CartPole, plan: FrontConfig, supplies: tuple[float, 
             supply: evaluator.evaluate(start, supply, plan.final, FINAL) for supply in {supply for supply, _ in wanted}
         }
         baseline[design] = {
-            lane: np.where(np.isfinite(point := found[lane[0]].points(lane[1], 0.5)[0]), point, np.nan)
-            for lane in wanted
+            objective: np.where(np.isfinite(point := found[objective[0]].points(objective[1], 0.5)[0]), point, np.nan)
+            for objective in wanted
         }
-    reference: dict[Lane, Numbers] = {}
+    reference: dict[Objective, Numbers] = {}
     own = wanted[0][0]
-    for lane in wanted:
-        points = np.array([of[lane] for of in baseline.values()])
+    for objective in wanted:
+        points = np.array([of[objective] for of in baseline.values()])
         points = points[np.isfinite(points[:, 0])]
-        if not len(points) and lane[0] == own:
+        if not len(points) and objective[0] == own:
             raise InputError(
                 "plant.motor.voltage_limit", own, "enough for the baseline controller to settle from half of the starts"
             )
-        reference[lane] = 1.1 * np.max(points, axis=0) if len(points) else reference[own, lane[1]]
+        reference[objective] = 1.1 * np.max(points, axis=0) if len(points) else reference[own, objective[1]]
     return ReferencePoints(baseline, reference)

@@ -33,19 +33,19 @@ from cpjax.plant.state import State
 from cpjax.sim.metrics import TimeOutside
 from cpjax.sim.rollout import measure
 from cpjax.study.fronts.cache import Search, load_or_run
-from cpjax.study.fronts.config import COSTS, FrontConfig, Lane
+from cpjax.study.fronts.config import COSTS, FrontConfig, Objective
 from cpjax.study.fronts.evaluator import (
     BATCH,
+    EVALUATION,
     EXPLORE,
     FINAL,
-    JUDGE,
-    SEMIFINAL,
+    REEVALUATION,
     Evaluated,
     Evaluator,
     concatenate,
     nondominated_sort,
 )
-from cpjax.study.fronts.reference_point import lanes
+from cpjax.study.fronts.reference_point import objectives
 from cpjax.tune import descent
 from cpjax.tune.objective import Effort, Lagrangian, RemainingTime, Travel, VoltageVariation
 from cpjax.workspace import Workspace
@@ -68,7 +68,7 @@ class Front:
       success: share of the final evaluation's initial states that each settles from (n,).
       vectors: the controllers' free parameters, unconstrained (n, d).
       volume: hypervolume up to the reference point.
-      best_success: the largest share of the semifinal's initial states that any controller settles from.
+      best_success: the largest share of the re-evaluation's initial states that any controller settles from.
     """
 
     points: Numbers
@@ -90,8 +90,8 @@ class Fronts:
       seconds: wall time, with that of cached searches [s].
     """
 
-    traced: dict[Lane, Front]
-    random: dict[Lane, Front]
+    traced: dict[Objective, Front]
+    random: dict[Objective, Front]
     steps: dict[float, dict[str, int]]
     seconds: float
 
@@ -100,7 +100,7 @@ def trace_fronts(
     plant: CartPole,
     design: DesignName,
     plan: FrontConfig,
-    reference: Mapping[Lane, Numbers],
+    reference: Mapping[Objective, Numbers],
     *,
     supplies: tuple[float, ...] = (),
     report: Report,
@@ -121,7 +121,7 @@ def trace_fronts(
     Raises:
       InputError: a plant without a voltage limit.
     """
-    wanted = lanes(plant, supplies)
+    wanted = objectives(plant, supplies)
     everywhere = list(dict.fromkeys(supply for supply, _ in wanted))
     parts = plan.steps + len(everywhere) + 2 * len(wanted)
     evaluator = Evaluator(plant, design, plan)
@@ -132,20 +132,20 @@ def trace_fronts(
         report(0, parts, "screening candidates")
         begun = {supply: evaluator.begin(supply, plan.candidates, 0) for supply in everywhere}
         tracer = Tracer(evaluator, plan)
-        met = tracer.trace(begun, wanted, lambda done, text: report(done, parts, text))
+        archive = tracer.trace(begun, wanted, lambda done, text: report(done, parts, text))
         counts = {supply: len(one.vectors) for supply, one in begun.items()}
-        return Search(met, counts, evaluator.steps, tracer.steps, time.perf_counter() - begin)
+        return Search(archive, counts, evaluator.steps, tracer.steps, time.perf_counter() - begin)
 
     def draw() -> Search:
         # As much work for each supply as tracing; as many candidates are evaluated further, the rest is screening.
         begin = time.perf_counter()
         evaluator.steps = Counter()
         drawn = {}
-        run = round(plan.horizon / plan.judging_dt)
+        run = round(plan.horizon / plan.evaluation_dt)
         for number, supply in enumerate(everywhere):
             report(plan.steps + number, parts, f"random search of the same cost, {supply:g} V")
             budget = traced.values[supply] + GRADIENT_STEP * traced.gradients[supply]
-            budget -= run * plan.judging * traced.begun[supply]
+            budget -= run * plan.evaluation * traced.begun[supply]
             drawn[supply] = evaluator.begin(supply, max(1, int(budget / (run * plan.screening))), 1)
         counts = {supply: len(one.vectors) for supply, one in drawn.items()}
         return Search(drawn, counts, evaluator.steps, dict.fromkeys(everywhere, 0), time.perf_counter() - begin)
@@ -162,28 +162,28 @@ def trace_fronts(
     }
 
     begin = time.perf_counter()
-    fronts: list[dict[Lane, Front]] = []
-    for which, found in enumerate((traced.met, random.met)):
+    fronts: list[dict[Objective, Front]] = []
+    for which, found in enumerate((traced.archive, random.archive)):
         fronts.append({})
-        for number, lane in enumerate(wanted):
+        for number, objective in enumerate(wanted):
             report(parts - (2 - which) * len(wanted) + number, parts, "measuring the points")
-            fronts[-1][lane] = _front(evaluator, plan, found[lane[0]], *lane, reference[lane])
+            fronts[-1][objective] = _front(evaluator, plan, found[objective[0]], *objective, reference[objective])
     report(parts, parts, "done")
     return Fronts(fronts[0], fronts[1], steps, traced.seconds + random.seconds + time.perf_counter() - begin)
 
 
 def _front(
-    evaluator: Evaluator, plan: FrontConfig, met: Evaluated, supply: float, cost: str, reference: Numbers
+    evaluator: Evaluator, plan: FrontConfig, archive: Evaluated, supply: float, cost: str, reference: Numbers
 ) -> Front:
-    """Returns the front of all controllers met, measured once more from unseen initial states."""
-    # Few initial states do not resolve a failure rate of 1 %: controllers with a few failures enter the semifinal too.
-    lenient = met.enough(1.0 - 3.0 * (1.0 - plan.success))
+    """Returns the front of an archive, measured once more from unseen initial states."""
+    # Few initial states do not resolve a failure rate of 1 %: those with a few failures are re-evaluated too.
+    lenient = archive.threshold(1.0 - 3.0 * (1.0 - plan.success))
     chosen = np.unique(
-        np.concatenate([nondominated_sort(met.points(cost, share), 3 * plan.bounds) for share in (1.0, lenient)])
+        np.concatenate([nondominated_sort(archive.points(cost, share), 3 * plan.bounds) for share in (1.0, lenient)])
     )
-    semifinal = evaluator.evaluate(met.vectors[chosen], supply, plan.semifinal, SEMIFINAL)
-    chosen = chosen[nondominated_sort(semifinal.points(cost, plan.success), plan.bounds)]
-    final = evaluator.evaluate(met.vectors[chosen], supply, plan.final, FINAL)
+    reevaluation = evaluator.evaluate(archive.vectors[chosen], supply, plan.reevaluation, REEVALUATION)
+    chosen = chosen[nondominated_sort(reevaluation.points(cost, plan.success), plan.bounds)]
+    final = evaluator.evaluate(archive.vectors[chosen], supply, plan.final, FINAL)
     points = final.points(cost, plan.success)
     kept = nondominated(points)
     return Front(
@@ -191,14 +191,14 @@ def _front(
         final.success[kept],
         final.vectors[kept],
         hypervolume(points[kept], reference),
-        float(np.max(semifinal.success)),
+        float(np.max(reevaluation.success)),
     )
 
 
 class Aim(NamedTuple):
     """Objective of one tuning: multipliers and supply."""
 
-    prices: jax.Array
+    multipliers: jax.Array
     """Multiplier of each of `COSTS` [s per unit of the cost]; zero but for the one that has a finite bound."""
     supply: jax.Array
     """Voltage limit [V]."""
@@ -215,7 +215,7 @@ class Tracer:
     """
 
     def __init__(self, evaluator: Evaluator, plan: FrontConfig) -> None:
-        self._judge, self._plan = evaluator, plan
+        self._evaluator, self._plan = evaluator, plan
         self.steps: Counter[float] = Counter()
         self._optimiser = optax.adam(optax.cosine_decay_schedule(plan.learning_rate, max(1, plan.steps), 0.1))
         self._spare = math.ceil(plan.spare_rate * plan.duration)
@@ -229,7 +229,7 @@ class Tracer:
         self.gradient = jax.jit(jax.shard_map(each, mesh=mesh, check_vma=False, **specs))
 
     def trace(
-        self, begun: dict[float, Evaluated], fronts: list[Lane], report: Callable[[int, str], None]
+        self, begun: dict[float, Evaluated], fronts: list[Objective], report: Callable[[int, str], None]
     ) -> dict[float, Evaluated]:
         """Runs all tunings and returns the archive: the controllers of `begun` and all evaluated on the way, by supply.
 
@@ -246,45 +246,47 @@ class Tracer:
         for row, (_, cost, bound) in enumerate(jobs):
             bounds[row, COSTS.index(cost)] = bound
         supplies = np.array([supply for supply, _, _ in jobs])
-        first = [begun[job[0]].fastest(*job[1:], plan.success, row % plan.variety)[0] for row, job in enumerate(jobs)]
+        ranks = [row % plan.initial_controllers for row in range(len(jobs))]
+        first = [begun[job[0]].fastest(*job[1:], plan.success, rank)[0] for job, rank in zip(jobs, ranks, strict=True)]
         vectors = self._placed(np.stack(first))  # sharded as after a step, else the gradient is compiled twice
-        prices = np.where(np.isfinite(bounds), plan.price, 0.0)  # multipliers of costs in units of their bounds
+        multipliers = np.where(np.isfinite(bounds), plan.multiplier, 0.0)  # of costs in units of their bounds
+        least, most = plan.multiplier / plan.multiplier_range, plan.multiplier * plan.multiplier_range
         state = self._optimiser.init(vectors)
-        met = dict(begun)
+        archive = dict(begun)
         random = np.random.default_rng([plan.seed, EXPLORE])
         for step in range(plan.steps):
-            aims = Aim(jnp.asarray(prices / bounds, vectors.dtype), jnp.asarray(supplies, vectors.dtype))
-            slope, spent = self.gradient(vectors, aims, self._judge.starts(plan.batch, BATCH, step))
-            grown = prices * np.exp(plan.price_rate * (np.asarray(spent) / bounds - 1.0))
-            prices = np.where(prices > 0.0, np.clip(grown, plan.price / plan.dearest, plan.price * plan.dearest), 0.0)
+            aims = Aim(jnp.asarray(multipliers / bounds, vectors.dtype), jnp.asarray(supplies, vectors.dtype))
+            slope, spent = self.gradient(vectors, aims, self._evaluator.starts(plan.batch, BATCH, step))
+            grown = multipliers * np.exp(plan.multiplier_rate * (np.asarray(spent) / bounds - 1.0))
+            multipliers = np.where(multipliers > 0.0, np.clip(grown, least, most), 0.0)
             vectors, state = descent.step(self._optimiser, vectors, state, slope)
             each = plan.batch * self.steps_of_a_run
-            self.steps.update({supply: each * int(np.sum(supplies == supply)) for supply in met})
-            if (step + 1) % plan.judge_every == 0 or step + 1 == plan.steps:
+            self.steps.update({supply: each * int(np.sum(supplies == supply)) for supply in archive})
+            if (step + 1) % plan.evaluate_every == 0 or step + 1 == plan.steps:
                 times = np.full(len(jobs), np.inf)
-                for supply in met:
+                for supply in archive:
                     rows = np.flatnonzero(supplies == supply)
-                    judged = self._judge.evaluate(np.asarray(vectors)[rows], supply, plan.judging, JUDGE)
-                    met[supply] = concatenate([met[supply], judged])
-                    well = judged.success >= met[supply].enough(plan.success)
-                    kept = well & np.all(judged.costs <= bounds[rows], axis=1)
-                    times[rows] = np.where(kept, judged.time, np.inf)
-                if step + 1 >= plan.exchange_from * plan.steps:
-                    better = [met[supply].fastest(cost, bound, plan.success) for supply, cost, bound in jobs]
+                    evaluated = self._evaluator.evaluate(np.asarray(vectors)[rows], supply, plan.evaluation, EVALUATION)
+                    archive[supply] = concatenate([archive[supply], evaluated])
+                    well = evaluated.success >= archive[supply].threshold(plan.success)
+                    kept = well & np.all(evaluated.costs <= bounds[rows], axis=1)
+                    times[rows] = np.where(kept, evaluated.time, np.inf)
+                if step + 1 >= plan.restart_from * plan.steps:
+                    better = [archive[supply].fastest(cost, bound, plan.success) for supply, cost, bound in jobs]
                     jump = np.array([time < 0.98 * now for (_, time), now in zip(better, times, strict=True)])
                     noise = plan.explore * (1.0 - (step + 1) / plan.steps) * random.standard_normal(vectors.shape)
                     taken = np.stack([vector for vector, _ in better]) + noise
                     vectors = jnp.where(jump[:, None], taken.astype(vectors.dtype), vectors)
                     state = jax.tree.map(functools.partial(_forgotten, rows=jump), state)
             report(step + 1, f"{len(jobs)} tunings side by side")
-        return met
+        return archive
 
     def _slope(self, vector: jax.Array, aim: Aim, starts: State) -> tuple[jax.Array, jax.Array]:
         """Returns the gradient (d,), norm-clipped per initial state and then averaged; and the mean costs."""
-        plan, plant, free = self._plan, self._judge.plant_at(aim.supply), self._judge.free_at(aim.supply)
+        plan, plant, free = self._plan, self._evaluator.plant_at(aim.supply), self._evaluator.free_at(aim.supply)
         costs = (FOLDS[cost] for cost in COSTS)
         terms = (TimeOutside(plan.width, plan.width), *costs, RemainingTime(plan.duration))
-        fold = Lagrangian(terms, tuple(aim.prices), plan.fine)
+        fold = Lagrangian(terms, tuple(aim.multipliers), plan.stop_penalty)
 
         def objective(vector: jax.Array, start: State) -> tuple[jax.Array, tuple[jax.Array, ...]]:
             found: tuple[jax.Array, tuple[jax.Array, ...]] = measure(
