@@ -47,7 +47,7 @@ def run(given: argparse.Namespace) -> int:
     controller = build_hybrid(sections["controller"], plant)
     notes = notes_on(sections["plant"], plant, {"the controller": controller})
     announce("audit-gradients", notes)
-    audit = run_audit(given.out, plant, controller, sections["audit"], given.seed, notes)
+    audit, _ = run_audit(given.out, plant, controller, sections["audit"], given.seed, notes)
 
     from cpjax.show.gradients import TITLE, cells, findings, header
 
@@ -64,8 +64,8 @@ def run(given: argparse.Namespace) -> int:
 
 def run_audit(
     out: Path, plant: CartPole, controller: Hybrid, setting: Mapping[str, Any], seed: int, notes: Sequence[str] = ()
-) -> GradientAudit:
-    """Runs the audit and writes its JSON and picture.
+) -> tuple[GradientAudit, bytes]:
+    """Runs the audit, writes its JSON and picture, and returns the audit and the picture.
 
     Args:
       setting: starts, count, duration [s] and dt [s]; missing ones have the options' defaults.
@@ -92,5 +92,4 @@ def run_audit(
     from cpjax.show.figures import save_figure
     from cpjax.show.gradients import picture
 
-    save_figure(out / "audit_gradients.png", picture([audit]))
-    return audit
+    return audit, save_figure(out / "audit_gradients.png", picture([audit]))

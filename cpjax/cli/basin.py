@@ -86,7 +86,7 @@ def run(given: argparse.Namespace) -> int:
     setting = {"duration": 10.0, "dt": 0.002, **sections["run"]}
     begin = time.perf_counter()
     chart = chart_of(chosen, given.seed)
-    rows = run_basin(given.out, given.out / "basin.parts", plant, controllers, chart, setting, notes)
+    rows, _ = run_basin(given.out, given.out / "basin.parts", plant, controllers, chart, setting, notes)
     seconds = time.perf_counter() - begin
     print_table(*table(rows), text_columns=1)
     steps = len(names) * chart.up.cells * chart.across.cells * round(setting["duration"] / setting["dt"])
@@ -103,7 +103,7 @@ def run_basin(
     chart: StartGrid,
     setting: dict[str, Any],
     notes: Sequence[str] = (),
-) -> dict[str, dict[str, Any]]:
+) -> tuple[dict[str, dict[str, Any]], bytes]:
     """Maps all controllers and, when all are done, writes basin.json, basin.png and their runs.
 
     Until then all results are in the folder `parts`, from where an interrupted map goes on, and the files of an earlier
@@ -116,7 +116,7 @@ def run_basin(
       notes: for the JSON.
 
     Returns:
-      Each controller's map in a few numbers, by name.
+      Each controller's map in a few numbers, by name, and the picture.
     """
     request = {
         "what": "share of a map from which controllers settle: sampled, not certified",
@@ -140,7 +140,7 @@ def run_basin(
             (parts / file).replace(out / file)
         files.write_bytes(out / "basin.png", picture)
         files.write_json(out / "basin.json", {**request, "basins": rows, "files": recorded, "notes": notes})
-    return rows
+    return rows, picture
 
 
 def chart_of(chosen: dict[str, Any], seed: int) -> StartGrid:

@@ -52,7 +52,7 @@ def run(given: argparse.Namespace) -> int:
     tuned = {design: _loaded(design, files[design]) for design in DESIGNS if design in files}
     notes = notes_on(sections["plant"], plant, {_name(one): one.controller for one in entries(plant, tuned)})
     announce("compare", notes)
-    results, shown_start = run_comparison(given.out, plant, setting, tuned, limit, notes)
+    results, shown_start, _ = run_comparison(given.out, plant, setting, tuned, limit, notes)
 
     from cpjax.show.comparison import findings
 
@@ -69,7 +69,7 @@ def run_comparison(
     tuned: Mapping[paper.Design, Hybrid],
     track_limit: float = float("inf"),
     notes: Sequence[str] = (),
-) -> tuple[list[Compared], str]:
+) -> tuple[list[Compared], str, dict[str, bytes]]:
     """Runs the comparison and writes its JSON and pictures.
 
     Args:
@@ -78,7 +78,7 @@ def run_comparison(
       notes: for the JSON.
 
     Returns:
-      The results, and in words which initial state the pictures of one run show.
+      The results, in words which initial state the pictures of one run show, and the pictures by name.
     """
     chosen = entries(plant, tuned)
     with progress("compare") as report:
@@ -101,10 +101,12 @@ def run_comparison(
     times = [float(run.metrics.settling_time) for _, run in shown.values() if bool(run.metrics.success)]
     until = min(setting.duration, 1.1 * max(times, default=setting.duration)) or setting.duration
     title = f"start {chosen_because}"
-    save_figure(out / "responses.png", responses(shown, until, float(plant.motor.voltage_limit), title))
-    save_figure(out / "phase.png", phase_portraits(plant, shown, title))
-    save_figure(out / "by_start.png", by_start(starts, results))
-    return results, chosen_because
+    figures = {
+        "responses": responses(shown, until, float(plant.motor.voltage_limit), title),
+        "phase": phase_portraits(plant, shown, title),
+        "by_start": by_start(starts, results),
+    }
+    return results, chosen_because, {name: save_figure(out / f"{name}.png", one) for name, one in figures.items()}
 
 
 def representative_start(starts: State, shown: Sequence[Compared]) -> tuple[State, str]:

@@ -71,7 +71,7 @@ def run(given: argparse.Namespace) -> int:
     plan = FrontConfig(seed=given.seed, **chosen)
     notes = notes_on(sections["plant"], plant)
     announce("pareto", notes)
-    found = run_pareto(given.out, given.out / "pareto.parts", plant, plan, supplies, notes)
+    found, _ = run_pareto(given.out, given.out / "pareto.parts", plant, plan, supplies, notes)
     print_table(*table(found), text_columns=2)
     from cpjax.show.front import findings
 
@@ -82,13 +82,16 @@ def run(given: argparse.Namespace) -> int:
 
 def run_pareto(
     out: Path, parts: Path, plant: CartPole, plan: FrontConfig, supplies: tuple[float, ...], notes: Sequence[str] = ()
-) -> Found:
+) -> tuple[Found, dict[str, bytes]]:
     """Traces the fronts of both designs and writes pareto.json, pareto.png and supplies.png.
 
     Args:
       parts: folder of finished searches, from which an interrupted run goes on; removed at the end.
       supplies: further voltage limits for settling time against effort [V].
       notes: for the JSON.
+
+    Returns:
+      The fronts, and the pictures by name.
     """
     from cpjax.study.fronts.reference_point import reference_points
 
@@ -106,9 +109,11 @@ def run_pareto(
             "notes": notes,
             "known": [{"name": name, "design": one.entry.design, **one.summary} for name, one in known],
         }
-        draw(out, plant, found, known)
+        pictures = draw(plant, found, known)
+        for name, picture in pictures.items():
+            files.write_bytes(out / f"{name}.png", picture)
         files.write_json(out / "pareto.json", document)
-    return found
+    return found, pictures
 
 
 def known_controllers(plant: CartPole, plan: FrontConfig) -> list[tuple[str, Compared]]:
@@ -177,8 +182,8 @@ def trace_design(
     return found
 
 
-def draw(out: Path, plant: CartPole, found: Found, controllers: list[tuple[str, Compared]]) -> None:
-    """Draws and writes pareto.png and supplies.png."""
+def draw(plant: CartPole, found: Found, controllers: list[tuple[str, Compared]]) -> dict[str, bytes]:
+    """Returns the pictures "pareto" and "supplies"."""
     from cpjax.show.figures import png
     from cpjax.show.front import Known, by_supply, fronts
 
@@ -199,9 +204,8 @@ def draw(out: Path, plant: CartPole, found: Found, controllers: list[tuple[str, 
             if row["supply"] == own:
                 baseline[row["cost"]][design] = np.asarray(row["baseline"], float)
     supplies = {supply: designs for (supply, cost), designs in curves.items() if cost == "effort"}
-    of_all_costs = png(fronts({cost: curves[own, cost] for cost in COSTS}, baseline, known))
-    files.write_bytes(out / "supplies.png", png(by_supply(supplies)))
-    files.write_bytes(out / "pareto.png", of_all_costs)
+    of_all_costs = fronts({cost: curves[own, cost] for cost in COSTS}, baseline, known)
+    return {"supplies": png(by_supply(supplies)), "pareto": png(of_all_costs)}
 
 
 def curves_of(found: Found) -> "dict[tuple[float, str], dict[str, Curve]]":

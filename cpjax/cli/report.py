@@ -75,7 +75,7 @@ def write_report(
     from cpjax.show.page import Page
     from cpjax.show.reproduction import HEADER, cells, findings, pictures
 
-    results, shown_start = run_comparison(given.out, paper.appendix_plant(), setting, {})
+    results, shown_start, drawn = run_comparison(given.out, paper.appendix_plant(), setting, {})
     page = Page(
         "Swing-up at 12 volts",
         "A student paper swings a pendulum up with an energy law and catches it with LQR or pole placement: here are "
@@ -114,7 +114,7 @@ def write_report(
     if studies != "none":
         sections_of.gradients(page, given, studies)
         sections_of.tuning(page, given, parts, studies)
-    sections_of.comparison(page, given, results, shown_start)
+    sections_of.comparison(page, results, shown_start, drawn)
     if studies != "none":
         sections_of.animation(page, given)
     if per_axis:

@@ -100,7 +100,7 @@ def forensics(page: Page, given: argparse.Namespace) -> None:
 def gradients(page: Page, given: argparse.Namespace, size: str) -> None:
     """Adds the section on which gradients through the switch can be trusted; `size` is quick or full."""
     plant = paper.appendix_plant()
-    audit = run_audit(given.out, plant, preset("lqr"), QUICK_AUDIT if size == "quick" else {}, given.seed)
+    audit, picture = run_audit(given.out, plant, preset("lqr"), QUICK_AUDIT if size == "quick" else {}, given.seed)
 
     page.section("Can the gradients be trusted?")
     page.text(
@@ -111,7 +111,7 @@ def gradients(page: Page, given: argparse.Namespace, size: str) -> None:
     for sentence in gradients_text.findings(audit):
         page.text(sentence)
     page.picture(
-        (given.out / "audit_gradients.png").read_bytes(),
+        picture,
         "Left and middle: error of derivatives against finite differences, with switches located and read once per "
         "step, by the run's length and its slowest crossing of the gate. Right: growth of a change of the start.",
     )
@@ -137,9 +137,9 @@ def tuning(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
         plan = TuningConfig(seed=given.seed, **(QUICK_TUNING if size == "quick" else {}))
         free = free_parameters(baseline(design, plant))
         folder = given.out / f"tune-{design}"
-        found = run_tuning(folder, plant, free, plan, parts / f"tune-{design}.npz")
+        found, picture = run_tuning(folder, plant, free, plan, parts / f"tune-{design}.npz")
         page.picture(
-            (folder / "tune.png").read_bytes(),
+            picture,
             f"{DESIGN_NAMES[design]}: settling time and share of starts of each restart (grey), and of the one that is "
             "best by then, over the steps of the optimiser. Success counts before time.",
         )
@@ -162,8 +162,8 @@ def tuning(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
     )
 
 
-def comparison(page: Page, given: argparse.Namespace, results: list[Compared], start: str) -> None:
-    """Adds the section on the paper's and the tuned controllers, from the results of `cpjax.cli.compare.compared`."""
+def comparison(page: Page, results: list[Compared], start: str, pictures: Mapping[str, bytes]) -> None:
+    """Adds the section on the paper's and the tuned controllers, from the results of `run_comparison`."""
     page.section("Against tuned gains")
     page.text(
         "Energy gain, cart terms, gate and Q or poles, tuned together by gradients through whole swing-ups (`cpjax "
@@ -175,16 +175,16 @@ def comparison(page: Page, given: argparse.Namespace, results: list[Compared], s
     page.table(comparison_text.HEADER, [comparison_text.cells(one) for one in results], text_columns=3)
     page.note("Means over the successful runs. Every number is in `compare.json` beside this page.")
     page.picture(
-        (given.out / "responses.png").read_bytes(),
+        pictures["responses"],
         f"Angle, cart and voltage under the best of the paper's controllers and the tuned ones, from start {start}.",
     )
     page.picture(
-        (given.out / "phase.png").read_bytes(),
+        pictures["phase"],
         "The same runs over angle and rate: a swing-up succeeds where it brings the pendulum to the energy of upright "
         "(dashed) and into the gate (orange), where the regulator takes over (thick).",
     )
     page.picture(
-        (given.out / "by_start.png").read_bytes(),
+        pictures["by_start"],
         "Settling time by the angle and rate of the start, the paper's best above and tuned below; crosses fail.",
     )
 
@@ -215,16 +215,17 @@ def basins(page: Page, given: argparse.Namespace, parts: Path, cells: int) -> No
     plant = paper.appendix_plant()
     controllers = {name: named_hybrid(name, plant) for name in basin.CONTROLLERS}
     chart = basin.chart_of({"cells": cells}, given.seed)
-    _, header, rows = basin.table(
-        basin.run_basin(given.out, parts / "basin", plant, controllers, chart, {"duration": 10.0, "dt": 0.002})
+    maps, picture = basin.run_basin(
+        given.out, parts / "basin", plant, controllers, chart, {"duration": 10.0, "dt": 0.002}
     )
+    _, header, rows = basin.table(maps)
     page.section("Basins of attraction")
     page.text(
         "One run of 10 s from every cell of a map of angle and rate, the cart at rest in the middle. This is the whole "
         "hybrid loop with its clip, sampled, not certified: a start between two that succeed may fail."
     )
     page.picture(
-        (given.out / "basin.png").read_bytes(),
+        picture,
         "Settling time (above) and changes of mode (below) by the initial state, grey where a run does not settle. "
         "Orange: the gate; dashed: the regulator demands the voltage limit; pink: certified for the linear model.",
     )
@@ -240,7 +241,7 @@ def fronts(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
       size: quick (few steps, the plant's own supply) or full.
     """
     plan = FrontConfig(seed=given.seed, **(QUICK_FRONTS if size == "quick" else {}))
-    found = pareto.run_pareto(
+    found, pictures = pareto.run_pareto(
         given.out, parts / "pareto", paper.appendix_plant(), plan, () if size == "quick" else pareto.SUPPLIES
     )
     page.section("Settling time against cost")
@@ -257,14 +258,12 @@ def fronts(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
         "the baseline: the untuned gains, chosen by rules of thumb, that every search begins with."
     )
     page.picture(
-        (given.out / "pareto.png").read_bytes(),
+        pictures["pareto"],
         "Mean cost against mean settling time, lower left is better. Filled: traced by gradients; crosses: random "
         "search with as much work; stars: the baselines; hollow: the paper's controllers and the shipped ones.",
     )
     if size == "full":
-        page.picture(
-            (given.out / "supplies.png").read_bytes(), "Settling time against effort, one panel for each supply."
-        )
+        page.picture(pictures["supplies"], "Settling time against effort, one panel for each supply.")
     for sentence in front_text.findings(pareto.curves_of(found)):
         page.text(sentence)
     _, header, rows = pareto.table(found)

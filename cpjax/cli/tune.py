@@ -63,7 +63,7 @@ def run(given: argparse.Namespace) -> int:
     names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}
     free = free_parameters(controller, **names, full_q=setting.pop("full_q", "diagonal") == "full")
     plan = TuningConfig(seed=given.seed, goal=Goal(**sections["goal"]), **setting)
-    tuning = run_tuning(given.out, plant, free, plan, given.out / "checkpoint.npz", notes)
+    tuning, _ = run_tuning(given.out, plant, free, plan, given.out / "checkpoint.npz", notes)
     before = np.asarray(free.physical(free.start()))
     rows = [(label, f"{a:.4g}", f"{b:.4g}") for label, a, b in zip(tuning.labels, before, tuning.physical, strict=True)]
     print_table("Parameters, SI units", ("parameter", "start", "tuned"), rows, text_columns=1)
@@ -78,8 +78,8 @@ def run(given: argparse.Namespace) -> int:
 
 def run_tuning(
     out: Path, plant: CartPole, free: FreeParameters, plan: TuningConfig, checkpoint: Path, notes: Sequence[str] = ()
-) -> "Tuning":
-    """Runs the tuning and writes tuned.json, tune.json and tune.png.
+) -> "tuple[Tuning, bytes]":
+    """Runs the tuning, writes tuned.json, tune.json and tune.png, and returns the tuning and the picture.
 
     Args:
       checkpoint: NPZ file from which an interrupted run goes on; removed at the end.
@@ -96,9 +96,9 @@ def run_tuning(
     from cpjax.show.figures import save_figure
     from cpjax.show.tuning import picture
 
-    save_figure(out / "tune.png", picture(tuning))
+    drawn = save_figure(out / "tune.png", picture(tuning))
     checkpoint.unlink(missing_ok=True)
-    return tuning
+    return tuning, drawn
 
 
 def _begin(name: str, plant: Any, chosen: dict[str, Any]) -> Hybrid:
