@@ -164,7 +164,9 @@ def _check_fields(name: str, tree: Any, batch: int | None) -> list[bool]:
             batched.append(not alone)
             if not alone and (batch is None or not fits(shape, (batch, *expected))):
                 more = (
-                    "batches go through jax.vmap" if batch is None else f"or {(batch, *expected)}, one for each start"
+                    "batches go through jax.vmap"
+                    if batch is None
+                    else f"or {(batch, *expected)}, one for each initial state"
                 )
                 raise InputError(path, f"array of shape {shape}", f"of shape {expected}; {more}")
             if rule is not None:

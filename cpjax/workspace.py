@@ -136,7 +136,7 @@ class Workspace:
             if path == self._record or path.name.startswith(".") or path.suffix == _DAMAGED or self._is_part(path):
                 continue
             allowed = (
-                "a place without the parts of other work (other options, starts or versions); "
+                "a place without the parts of other work (other options, initial states or versions); "
                 f"{path.name} in it is of such work: delete the folder first"
             )
             raise InputError("path", str(self.folder), allowed)

@@ -404,12 +404,12 @@ def test_a_step_too_small_for_any_count_of_steps_is_refused():
             "'State with dtypes x: float32, x_dot: float64'",
             "of one dtype, float32 or float64, throughout",
         ),
-        (State(np.ones(1), 0.0, 0.0, 0.0), "start.x", "'array of shape (1,)'", "one number; many starts go through"),
+        (State(np.ones(1), 0.0, 0.0, 0.0), "start.x", "'array of shape (1,)'", "one number; many initial states go through"),
         (
             State(0.0, 0.0, np.ones(3), 0.0),
             "start.theta",
             "'array of shape (3,)'",
-            "one number; many starts go through",
+            "one number; many initial states go through",
         ),
     ],
     ids=lambda v: "",
@@ -488,7 +488,7 @@ def test_a_batched_component_without_vmap_is_refused(arguments):
         (State(np.arange(2), 0.0, 0.0, 0.0), {}, "starts.x", "'array of dtype int64'", "of dtype float32 or float64"),
         (np.ones((2, 4)), {}, "starts", "array(", "a cpjax.State"),
         *(
-            (State(np.ones(2), 0.0, 0.0, 0.0), {name: v}, name, repr(v), "a whole number of starts, at least 1")
+            (State(np.ones(2), 0.0, 0.0, 0.0), {name: v}, name, repr(v), "a whole number of initial states, at least 1")
             for v in (0, -1, 1.0, True, "1")
             for name in ("chunk", "block")
         ),

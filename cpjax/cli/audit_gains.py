@@ -24,7 +24,7 @@ OPTIONS = [
     Option("gains", "poles", "what it places, such as -3 -4 -5+2j -5-2j", count=4, numbers=True),
     Option("audit", "parameters", "those that may change, with commas between (default all of the plant's)"),
     Option("audit", "most", "how many may change at once (default 2)", int),
-    Option("audit", "starts", "random starts for each set of them (default 32)", int),
+    Option("audit", "starts", "random initial states for each set of them (default 32)", int),
 ]
 
 

@@ -21,8 +21,8 @@ from cpjax.study.named_parameters import parametrise
 OPTIONS = [
     *PLANT_OPTIONS,
     *CONTROLLER_OPTIONS,
-    Option("audit", "starts", "set of starts (default hanging)", choices=START_SETS),
-    Option("audit", "count", "number of starts (default 16)", int),
+    Option("audit", "starts", "set of initial states (default hanging)", choices=START_SETS),
+    Option("audit", "count", "number of initial states (default 16)", int),
     Option("audit", "duration", "length of each rollout [s] (default 4)", float),
     Option("audit", "dt", "integration step [s] (default 0.001)", float),
 ]
@@ -33,7 +33,7 @@ def add_command(commands: Any) -> None:
     text = (
         "Compares gradients through whole swing-ups, computed in three ways (switches located, switches read once per "
         "step, smooth surrogates), with finite differences, for each parameter of plant and controller; and says of "
-        "each start whether its gradient can be trusted, and why not. Writes audit_gradients.json and .png."
+        "each initial state whether its gradient can be trusted, and why not. Writes audit_gradients.json and .png."
     )
     parser = commands.add_parser("audit-gradients", help="which gradients can be trusted", description=text)
     add_options(parser, OPTIONS, out="out/audit-gradients")

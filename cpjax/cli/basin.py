@@ -41,8 +41,8 @@ OPTIONS = [
         Option(
             "map",
             name,
-            f"range of {name} [{unit}]: of its axis (default {low:.4g} {high:.4g}), or else what each start's is drawn "
-            "from (default 0 0)",
+            f"range of {name} [{unit}]: of its axis (default {low:.4g} {high:.4g}), or else what each initial state's "
+            "is drawn from (default 0 0)",
             float,
             count=2,
         )
@@ -64,8 +64,8 @@ OPTIONS = [
 def add_command(commands: Any) -> None:
     """Declares the command."""
     text = (
-        "Runs controllers from every cell of a map over two coordinates of the start. Writes basin.png, basin.json and "
-        "the metrics of all runs. Sampled, not certified. An interrupted map goes on where it stopped."
+        "Runs controllers from every cell of a map over two coordinates of the initial state. Writes basin.png, "
+        "basin.json and the metrics of all runs. Sampled, not certified. An interrupted map goes on where it stopped."
     )
     parser = commands.add_parser("basin", help="where controllers work, as maps", description=text)
     add_options(parser, OPTIONS, out="out/basin")

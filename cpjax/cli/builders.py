@@ -90,7 +90,13 @@ CONTROLLER_OPTIONS = [
 ]
 
 START_OPTIONS = [
-    Option("start", "set", "draw the start from this set with --seed (default rest)", choices=START_SETS, flag="start"),
+    Option(
+        "start",
+        "set",
+        "draw the initial state from this set with --seed (default rest)",
+        choices=START_SETS,
+        flag="start",
+    ),
     *(Option("start", n, f"start at this {n} [{u}] instead", float) for n, u in zip(NAMES, UNITS, strict=True)),
 ]
 
@@ -104,8 +110,8 @@ RUN_OPTIONS = [
 ]
 
 EVALUATION_OPTIONS = [
-    Option("evaluation", "starts", "set of starts (default hanging)", choices=START_SETS),
-    Option("evaluation", "count", "number of starts (default 4096)", int),
+    Option("evaluation", "starts", "set of initial states (default hanging)", choices=START_SETS),
+    Option("evaluation", "count", "number of initial states (default 4096)", int),
     Option("evaluation", "duration", "length of each rollout [s] (default 20)", float),
     Option("evaluation", "dt", "integration step and control period [s] (default 0.002)", float),
 ]

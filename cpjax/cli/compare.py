@@ -35,7 +35,7 @@ def add_command(commands: Any) -> None:
     """Declares the command."""
     text = (
         "The paper's gains, as printed and as computed, with its law as printed and as corrected, against tuned "
-        "controllers, over the same starts. Writes compare.json, responses.png, phase.png and by_start.png."
+        "controllers, over the same initial states. Writes compare.json, responses.png, phase.png and by_start.png."
     )
     parser = commands.add_parser("compare", help="the paper's gains against tuned ones", description=text)
     add_options(parser, OPTIONS, out="out/compare")
@@ -120,7 +120,7 @@ def representative_start(starts: State, shown: Sequence[Compared]) -> tuple[Stat
     index = int(np.argmax(caught))
     start = State(*(float(np.asarray(getattr(starts, name))[index]) for name in NAMES))
     if not caught[index]:
-        return start, f"the first of {len(caught)}: no start is caught by all shown controllers"
+        return start, f"the first of {len(caught)}: no initial state is caught by all shown controllers"
     return start, f"number {index + 1} of {len(caught)}, the first that all shown controllers catch"
 
 

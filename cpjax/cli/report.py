@@ -79,24 +79,24 @@ def write_report(
     page = Page(
         "Swing-up at 12 volts",
         "A student paper swings a pendulum up with an energy law and catches it with LQR or pole placement: here are "
-        "its controllers, as printed, as corrected and as tuned by gradients, run from many starts.",
+        "its controllers, as printed, as corrected and as tuned by gradients, run from many initial states.",
     )
     page.numbers(comparison.headline(results))
     picture = save_figure(given.out / "success.png", success_rates(rows))
-    page.picture(picture, "Share of starts caught by each law, plant and regulator, with 95 % intervals.")
+    page.picture(picture, "Share of initial states caught by each law, plant and regulator, with 95 % intervals.")
     page.section("Setup")
     page.text(
-        f"{setting.count} starts from the set `{setting.starts}` (seed {setting.seed}), {setting.duration:g} s each, "
-        f"RK4 with a step of {1000 * setting.dt:g} ms, the control held over a step, the voltage clipped at 12 V. "
-        "A run succeeds if from some moment, at least 1 s before its end, angle and cart stay within 0.05 rad and "
+        f"{setting.count} initial states from the set `{setting.starts}` (seed {setting.seed}), {setting.duration:g} s "
+        f"each, RK4 with a step of {1000 * setting.dt:g} ms, the control held over a step, the voltage clipped at 12 "
+        "V. A run succeeds if from some moment, at least 1 s before its end, angle and cart stay within 0.05 rad and "
         "0.05 m of upright and centre."
     )
     page.text(
-        "`hanging` starts lie within 0.3 rad, 0.3 rad/s and 0.1 m of hanging at rest in the middle. The `appendix` "
-        "plant has the paper's printed parameters; the `identified` one those from which its printed gains follow. Law "
-        "`as-printed` has the paper's signs, `corrected` those that its derivation gives, with its gain k = 0.2, "
-        "`corrected-as-voltage` takes the wanted acceleration for a voltage, and `corrected-centred` has k = 5 and "
-        "holds the cart near the middle."
+        "`hanging` initial states lie within 0.3 rad, 0.3 rad/s and 0.1 m of hanging at rest in the middle. The "
+        "`appendix` plant has the paper's printed parameters; the `identified` one those from which its printed gains "
+        "follow. Law `as-printed` has the paper's signs, `corrected` those that its derivation gives, with its gain k "
+        "= 0.2, `corrected-as-voltage` takes the wanted acceleration for a voltage, and `corrected-centred` has k = 5 "
+        "and holds the cart near the middle."
     )
     page.section("Results")
     for sentence in (*findings(rows), comparison.findings(results)[-1]):

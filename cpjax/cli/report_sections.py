@@ -113,7 +113,8 @@ def gradients(page: Page, given: argparse.Namespace, size: str) -> None:
     page.picture(
         picture,
         "Left and middle: error of derivatives against finite differences, with switches located and read once per "
-        "step, by the run's length and its slowest crossing of the gate. Right: growth of a change of the start.",
+        "step, by the run's length and its slowest crossing of the gate. Right: growth of a change of the initial "
+        "state.",
     )
     page.table(gradients_text.header(audit), gradients_text.cells(audit), text_columns=1)
     page.note(gradients_text.TITLE + ". Every number is in `audit_gradients.json`.")
@@ -140,8 +141,8 @@ def tuning(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
         found, picture = run_tuning(folder, plant, free, plan, parts / f"tune-{design}.npz")
         page.picture(
             picture,
-            f"{DESIGN_NAMES[design]}: settling time and share of starts of each restart (grey), and of the one that is "
-            "best by then, over the steps of the optimiser. Success counts before time.",
+            f"{DESIGN_NAMES[design]}: settling time and share of initial states of each restart (grey), and of the one "
+            "that is best by then, over the steps of the optimiser. Success counts before time.",
         )
         rows.append(
             [
@@ -167,8 +168,8 @@ def comparison(page: Page, results: list[Compared], start: str, pictures: Mappin
     page.section("Against tuned gains")
     page.text(
         "Energy gain, cart terms, gate and Q or poles, tuned together by gradients through whole swing-ups (`cpjax "
-        "tune`), from the same starts as above, of which the tuning has seen none. Which of the two methods is better "
-        "at 12 V?"
+        "tune`), from the same initial states as above, of which the tuning has seen none. Which of the two methods is "
+        "better at 12 V?"
     )
     for sentence in comparison_text.findings(results):
         page.text(sentence)
@@ -176,7 +177,8 @@ def comparison(page: Page, results: list[Compared], start: str, pictures: Mappin
     page.note("Means over the successful runs. Every number is in `compare.json` beside this page.")
     page.picture(
         pictures["responses"],
-        f"Angle, cart and voltage under the best of the paper's controllers and the tuned ones, from start {start}.",
+        "Angle, cart and voltage under the best of the paper's controllers and the tuned ones, from initial state "
+        f"{start}.",
     )
     page.picture(
         pictures["phase"],
@@ -185,7 +187,8 @@ def comparison(page: Page, results: list[Compared], start: str, pictures: Mappin
     )
     page.picture(
         pictures["by_start"],
-        "Settling time by the angle and rate of the start, the paper's best above and tuned below; crosses fail.",
+        "Settling time by the angle and rate of the initial state, the paper's best above and tuned below; crosses "
+        "fail.",
     )
 
 
@@ -222,7 +225,7 @@ def basins(page: Page, given: argparse.Namespace, parts: Path, cells: int) -> No
     page.section("Basins of attraction")
     page.text(
         "One run of 10 s from every cell of a map of angle and rate, the cart at rest in the middle. This is the whole "
-        "hybrid loop with its clip, sampled, not certified: a start between two that succeed may fail."
+        "hybrid loop with its clip, sampled, not certified: an initial state between two that succeed may fail."
     )
     page.picture(
         picture,
@@ -248,11 +251,11 @@ def fronts(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
     if size == "quick":
         page.text(
             f"A quick version, far from converged: {plan.bounds + 1} tunings for each cost, {plan.steps} steps, points "
-            f"measured from {plan.final} starts. `cpjax pareto`, or `make report-full`, does it in full."
+            f"measured from {plan.final} initial states. `cpjax pareto`, or `make report-full`, does it in full."
         )
     page.text(
         "LQR or pole placement, and what does settling faster cost? Each point is a controller that settles from "
-        f"{100 * plan.success:g} % of unseen starts at least, and that no other found beats in both. Traced by "
+        f"{100 * plan.success:g} % of unseen initial states at least, and that no other found beats in both. Traced by "
         "gradients, many tunings side by side under one `vmap`, each with a bound on its cost; a random search of as "
         "many steps is drawn beside them. The hypervolume of a front is the area that it dominates, up to 1.1 times "
         "the baseline: the untuned gains, chosen by rules of thumb, that every search begins with."

@@ -16,11 +16,11 @@ from cpjax.paper.reproduction import EvaluationConfig, reproduce
 def add_command(commands: Any) -> None:
     """Declares the command."""
     text = (
-        "Every swing-up law, plant, regulator and gain of the paper over one seeded set of starts. Writes "
+        "Every swing-up law, plant, regulator and gain of the paper over one seeded set of initial states. Writes "
         "reproduction.json, success.png and our figures in the places of the paper's Figures 3 to 6. An interrupted "
         "run goes on where it stopped."
     )
-    parser = commands.add_parser("reproduce", help="the paper's controllers over many starts", description=text)
+    parser = commands.add_parser("reproduce", help="the paper's controllers over many initial states", description=text)
     add_options(parser, EVALUATION_OPTIONS, out="out/reproduce")
     parser.set_defaults(run=run, many_starts=True)
 

@@ -33,10 +33,11 @@ OPTIONS = [
 def add_command(commands: Any) -> None:
     """Declares the command."""
     text = (
-        "Simulates a controller from many starts, on all cores. Writes the metrics of each to metrics.npz (.parquet, "
-        ".json), sweep.json and sweep.png; or trajectories, in parts. An interrupted run goes on where it stopped."
+        "Simulates a controller from many initial states, on all cores. Writes the metrics of each to metrics.npz "
+        "(.parquet, .json), sweep.json and sweep.png; or trajectories, in parts. An interrupted run goes on where it "
+        "stopped."
     )
-    parser = commands.add_parser("sweep", help="one controller from many starts", description=text)
+    parser = commands.add_parser("sweep", help="one controller from many initial states", description=text)
     add_options(parser, OPTIONS, out="out/sweep")
     parser.set_defaults(run=run, many_starts=True)
 
@@ -60,7 +61,7 @@ def run(given: argparse.Namespace) -> int:
 
         def tell(done: int, total: int) -> None:
             rate = done * round(setting["duration"] / setting["dt"]) / (time.perf_counter() - begin) / 1e6
-            report(done, total, f"starts, {rate:.0f} M steps/s")
+            report(done, total, f"initial states, {rate:.0f} M steps/s")
 
         metrics = record_sweep(
             path,
@@ -105,7 +106,7 @@ def run(given: argparse.Namespace) -> int:
     rows = [(cost, *(f"{spread[cost][key]:.4g}" for key in ("mean", "median", "max"))) for cost in COSTS]
     print_table("Over the successful runs", ("metric", "mean", "median", "max"), rows, text_columns=1)
     low, high = (100 * bound for bound in summary["success_interval"])
-    say(f"{100 * summary['success_rate']:.2f} % of {count} starts settle ({low:.2f} to {high:.2f} %)")
+    say(f"{100 * summary['success_rate']:.2f} % of {count} initial states settle ({low:.2f} to {high:.2f} %)")
     say(speed)
     say(f"wrote {path}, sweep.json and sweep.png")
     return 0

@@ -42,8 +42,8 @@ _ROWS = (
 
 def add_command(commands: Any) -> None:
     """Declares the command."""
-    text = "Swing up from one start: prints the metrics, writes swingup.png and swingup.json."
-    parser = commands.add_parser("swingup", help="one start: table, time plots, JSON", description=text)
+    text = "Swing up from one initial state: prints the metrics, writes swingup.png and swingup.json."
+    parser = commands.add_parser("swingup", help="one initial state: table, time plots, JSON", description=text)
     add_options(parser, OPTIONS, out="out/swingup")
     parser.set_defaults(run=run)
 

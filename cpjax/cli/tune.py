@@ -69,8 +69,9 @@ def run(given: argparse.Namespace) -> int:
     print_table("Parameters, SI units", ("parameter", "start", "tuned"), rows, text_columns=1)
     after = f", after {tuning.settling_time:.3f} s on average" if tuning.success_rate > 0.0 else ""
     say(
-        f"{100 * tuning.success_rate:.2f} % of {plan.final} starts settle{after}; {tuning.value_steps / 1e6:.1f} M "
-        f"steps of values, {tuning.gradient_steps / 1e6:.2f} M of gradients, {tuning.seconds:.0f} s"
+        f"{100 * tuning.success_rate:.2f} % of {plan.final} initial states settle{after}; "
+        f"{tuning.value_steps / 1e6:.1f} M steps of values, {tuning.gradient_steps / 1e6:.2f} M of gradients, "
+        f"{tuning.seconds:.0f} s"
     )
     say(f"wrote {given.out / 'tuned.json'}, tune.json and tune.png")
     return 0 if tuning.success_rate > 0.0 else 1

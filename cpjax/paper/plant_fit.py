@@ -143,7 +143,7 @@ def fit_all(
     ends = []
     for first in range(0, len(x), size):
         if progress is not None:
-            text = f"sets of up to {most} parameters, {count} starts each"
+            text = f"sets of up to {most} parameters, {count} initial states each"
             progress(first // count, len(sets), text)
         now = np.arange(first, first + size) % len(x)  # surplus elements of the last batch are dropped below
         ends.append(_fitted(prints, *_numbers(plant), base, chosen[now], jnp.asarray(x[now])))

@@ -97,7 +97,7 @@ def reproduce(
     if path is None:
         return _rows(setting, progress, None)
     what = {
-        "what": "the paper's controllers over a seeded set of starts",
+        "what": "the paper's controllers over a seeded set of initial states",
         "versions": files.versions(),
         "setting": dataclasses.asdict(setting),
     }
@@ -148,7 +148,7 @@ def representative(law: str, plant: str, setting: EvaluationConfig) -> tuple[str
     index = int(np.argsort(times)[(successes - 1) // 2]) if successes else 0
     words = "the median of those that both catch," if successes else "the first, for none is caught by both,"
     start: State = jax.tree.map(lambda column: float(column[index]), starts)
-    return f"{words} of {setting.count} {setting.starts} starts (number {index + 1})", start
+    return f"{words} of {setting.count} {setting.starts} initial states (number {index + 1})", start
 
 
 def trajectory(law: str, design: paper.Design, plant: str, start: State, setting: EvaluationConfig) -> Trajectory:

@@ -45,7 +45,7 @@ def headline(results: Sequence[Compared]) -> list[tuple[str, str, str]]:
         if one.entry.gains != "computed":
             low, high = one.summary["success_interval"]
             value = f"{100 * one.summary['success_rate']:.1f} %"
-            what = f"of starts settle: {one.entry.name}, {DESIGN_NAMES[one.entry.design]}"
+            what = f"of initial states settle: {one.entry.name}, {DESIGN_NAMES[one.entry.design]}"
             numbers.append((value, f"({100 * low:.1f} to {100 * high:.1f})", what))
     return numbers
 
@@ -86,16 +86,17 @@ def _answer(results: Sequence[Compared], *, tuned: bool) -> str:
     p = mcnemar_p_value(int(np.sum(caught_by_a & ~caught_by_b)), int(np.sum(caught_by_b & ~caught_by_a)))
     verdict = "a difference" if p < 1e-3 else "no difference at 99.9 %"
     if mcnemar_p_value(len(caught_by_a), 0) >= 1e-3:
-        verdict = "too few starts to show a difference"
+        verdict = "too few initial states to show a difference"
 
     def words(one: Compared) -> str:
         good = one.summary["over_successes"]
         if not one.summary["successes"]:
-            return f"{DESIGN_NAMES[one.entry.design]} catches none of the starts"
+            return f"{DESIGN_NAMES[one.entry.design]} catches none of the initial states"
         return (
-            f"{DESIGN_NAMES[one.entry.design]} catches {100 * one.summary['success_rate']:.2f} % of the starts, "
-            f"settles after {good['settling_time']['mean']:.2f} s, uses {good['cart_travel']['mean']:.2f} m and "
-            f"{good['effort']['mean']:.0f} V^2 s, and moves the voltage by {good['voltage_variation']['mean']:.0f} V"
+            f"{DESIGN_NAMES[one.entry.design]} catches {100 * one.summary['success_rate']:.2f} % of the initial "
+            f"states, settles after {good['settling_time']['mean']:.2f} s, uses {good['cart_travel']['mean']:.2f} m "
+            f"and {good['effort']['mean']:.0f} V^2 s, and moves the voltage by {good['voltage_variation']['mean']:.0f} "
+            "V"
         )
 
     return f"{kind}: {words(a)}; {words(b)} ({verdict} in success by McNemar's test)."
@@ -232,9 +233,9 @@ def by_start(starts: State, results: Sequence[Compared]) -> Figure:
             drawn = panel.scatter(theta[good], rate[good], c=time[good], s=5, cmap="viridis", norm=norm)
             panel.plot(theta[~good], rate[~good], "x", color="0.55", markersize=3, alpha=0.6)
             panel.set_title(f"{DESIGN_NAMES[design]}: {_label(one)}", fontsize="medium")
-        axes[1, column].set_xlabel(r"$\theta$ at the start [rad]")
+        axes[1, column].set_xlabel(r"initial $\theta$ [rad]")
     for row in range(2):
-        axes[row, 0].set_ylabel(r"$\dot\theta$ at the start [rad/s]")
+        axes[row, 0].set_ylabel(r"initial $\dot\theta$ [rad/s]")
     ticks = [tick for tick in (0.1, 0.2, 0.5, 1, 2, 3, 5, 10, 20, 50, 100) if low <= tick <= high]
     bar = figure.colorbar(drawn, ax=axes, label="settling time [s] (x: fails)", ticks=ticks)
     bar.ax.set_yticklabels([f"{tick:g}" for tick in ticks])

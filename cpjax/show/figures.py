@@ -122,7 +122,7 @@ def success_rates(rows: Sequence[Mapping[str, Any]]) -> Figure:
             )
         axes.set_title(f"{plant} plant")
         axes.set_xlim(-3, 103)
-        axes.set_xlabel("successful starts [%]")
+        axes.set_xlabel("successful initial states [%]")
         axes.grid(axis="x", alpha=0.3)
     panels[0].set_yticks(range(len(laws)), laws)
     panels[0].invert_yaxis()

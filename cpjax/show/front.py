@@ -140,7 +140,11 @@ def by_supply(curves: Mapping[float, Mapping[str, Curve]]) -> Figure:
             _draw(axes, design, curve)
         if not any(len(curve.traced) + len(curve.random) for curve in designs.values()):
             axes.text(
-                0.5, 0.5, "no controller found\nthat settles from enough starts", ha="center", transform=axes.transAxes
+                0.5,
+                0.5,
+                "no controller found\nthat settles from enough initial states",
+                ha="center",
+                transform=axes.transAxes,
             )
         axes.set_title(f"{supply:g} V\n{_verdict(designs)}", fontsize="medium")
         _time_axis(axes)

@@ -13,7 +13,14 @@ from cpjax.paper.gain_identification import Direction, GainAudit
 from cpjax.paper.plant_fit import EXPLAINED, Fit
 from cpjax.plant import CartPole, parameters_of, with_parameters
 
-FIT_HEADER = ("changed", "to", "worst residual", "force per volt [N/V]", "total damping [N s/m]", "starts that agree")
+FIT_HEADER = (
+    "changed",
+    "to",
+    "worst residual",
+    "force per volt [N/V]",
+    "total damping [N s/m]",
+    "initial states that agree",
+)
 DIRECTION_HEADER = ("combination of relative changes", "sensitivity", "known to")
 
 _ROUGHLY = 5.0  # sensitivity at which a change of 10 % moves the gains by half a last digit

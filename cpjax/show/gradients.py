@@ -46,10 +46,10 @@ def findings(audit: GradientAudit) -> list[str]:
     """Returns the results of the audit as sentences with figures."""
     kinds = [kind for kind, _ in audit.verdicts]
     counts = ", ".join(f"{kinds.count(k)} {k}" for k in ("trustworthy", "grazing", "chaotic", "stopped"))
-    sentences = [f"Of {len(kinds)} starts: {counts}."]
+    sentences = [f"Of {len(kinds)} initial states: {counts}."]
     chosen = audit.compared[:, -1]
     if not chosen.any():
-        return [*sentences, "No start is left for a comparison."]
+        return [*sentences, "No initial state is left for a comparison."]
     for name, gradient in methods(audit):
         errors, wrong = audit.errors(gradient)[:, -1][chosen], audit.wrong_signs(gradient)[:, -1][chosen]
         sentences.append(
@@ -99,7 +99,7 @@ def picture(audits: Sequence[GradientAudit]) -> Figure:
     growth.semilogy(audits[0].horizons, growths.T, color="#009E73", alpha=min(1.0, 8.0 / len(growths)))
     growth.semilogy(audits[0].horizons, np.nanmedian(growths, axis=0), "o-", color="#000000", label="median")
     growth.set_xlabel("time [s]")
-    growth.set_ylabel("norm of d state / d start")
+    growth.set_ylabel("norm of d state / d initial state")
     growth.set_title("growth of a change of the initial state", loc="left")
     growth.legend()
     for axes in (by_horizon, by_speed, growth):

@@ -97,8 +97,8 @@ def findings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         f"With a larger energy gain and the cart held near the middle (no longer the paper's law), the printed gains "
         f"catch {caught('corrected-centred')}.",
         f"The paper sees slightly better performance with LQR. In these {len(pairs)} comparisons on both plants, with "
-        f"the gains as printed and the clip at 12 V, pole placement catches more starts in {ahead['placement']}, LQR "
-        f"in {ahead['lqr']} (differences beyond a two-proportion test at 99.9 %).",
+        "the gains as printed and the clip at 12 V, pole placement catches more initial states in "
+        f"{ahead['placement']}, LQR in {ahead['lqr']} (differences beyond a two-proportion test at 99.9 %).",
     ]
 
 

@@ -27,8 +27,8 @@ def picture(starts: State, metrics: Metrics) -> Figure:
     won = good[some]
     dots = left.scatter(from_hanging[won], rate[won], c=times[some][won], s=4, cmap="viridis", rasterized=True)
     left.plot(from_hanging[~won], rate[~won], ".", color=_FAILED, markersize=3, label="failed")
-    left.set_xlabel("start: angle from hanging [deg]")
-    left.set_ylabel("start: angular rate [rad/s]")
+    left.set_xlabel("initial angle from hanging [deg]")
+    left.set_ylabel("initial angular rate [rad/s]")
     if won.any():
         figure.colorbar(dots, ax=left, label="settling time [s]")
     if not won.all():
@@ -38,5 +38,5 @@ def picture(starts: State, metrics: Metrics) -> Figure:
     right.set_xlabel("settling time [s]")
     right.set_ylabel("starts")
     right.grid(alpha=0.3)
-    figure.suptitle(f"{good.sum()} of {good.size} starts settle")
+    figure.suptitle(f"{good.sum()} of {good.size} initial states settle")
     return figure

@@ -25,7 +25,7 @@ def picture(tuning: Tuning) -> Figure:
         axes.plot(steps, values[rows, best], "o-", color=colour, markersize=5, label="best of this validation by score")
         axes.grid(alpha=0.3)
     above.set_ylabel("mean settling time [s]")
-    below.set_ylabel("successful starts [%]")
+    below.set_ylabel("successful initial states [%]")
     below.set_xlabel("optimiser step")
     above.legend(frameon=False)
     chosen = f"chosen: {tuning.settling_time:.2f} s, {100 * tuning.success_rate:.2f} % (last comparison)"

@@ -62,7 +62,7 @@ def gradients(
     if not isinstance(direction, str) or direction not in get_args(Direction):
         raise InputError("direction", direction, "reverse or forward")
     if isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1:
-        raise InputError("chunk", chunk, "a whole number of starts, at least 1")
+        raise InputError("chunk", chunk, "a whole number of initial states, at least 1")
     for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):
         if not (isinstance(leaf, float) or jnp.issubdtype(getattr(leaf, "dtype", int), jnp.floating)):
             name = f"parameters{jax.tree_util.keystr(path)}"

@@ -86,7 +86,7 @@ def checked_tree(
     else:
         for name, value in zip(names, values, strict=True):
             if value.ndim:
-                allowed = "one number; many starts go through cpjax.sweep or jax.vmap"
+                allowed = "one number; many initial states go through cpjax.sweep or jax.vmap"
                 raise InputError(f"{field}.{name}", f"array of shape {value.shape}", allowed)
     return jax.tree.unflatten(structure, values), dtype, count
 

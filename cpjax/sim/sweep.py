@@ -204,7 +204,7 @@ def prepare(
     """Checks a sweep's arguments and divides its initial states into blocks; arguments and errors as for `sweep`."""
     for name, value in (("chunk", chunk), ("block", block)):
         if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-            raise InputError(name, value, "a whole number of starts, at least 1")
+            raise InputError(name, value, "a whole number of initial states, at least 1")
     starts, arguments, settings, batched = prepared(plant, controller, starts, metrics, batched=True, **simulation)
     settings = settings._replace(fast_path=settings.clock == "sampled" and settings.switching == "per_step")
     leaves, structure = jax.tree.flatten((starts, arguments))

@@ -141,7 +141,7 @@ class GradientAudit:
             if flag & STOPPED:
                 found.append(("stopped", describe(flag)))
             elif not growth <= LARGE_GROWTH:
-                found.append(("chaotic", f"a change of the start grows {growth:.2g} times"))
+                found.append(("chaotic", f"a change of the initial state grows {growth:.2g} times"))
             elif speed < SLOW_CROSSING:
                 found.append(("grazing", f"crosses the gate at {speed:.2g} / s"))
             else:

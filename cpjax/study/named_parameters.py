@@ -105,7 +105,9 @@ def as_matrix(parameters: Mapping[str, Any], n: int, each: bool) -> tuple[tuple[
             raise InputError(f"parameters[{name}]", value, "a finite number or vector") from problem
         array = array if each else np.broadcast_to(array, (n, *array.shape))
         if array.ndim not in (1, 2) or array.shape[0] != n or not np.all(np.isfinite(array)):
-            raise InputError(f"parameters[{name}]", value, "a finite number or vector" + (", for each start" * each))
+            raise InputError(
+                f"parameters[{name}]", value, "a finite number or vector" + (", for each initial state" * each)
+            )
         shapes.append((name, array.shape[1:]))
         names += [name] if array.ndim == 1 else [f"{name}[{i}]" for i in range(array.shape[1])]
         columns.append(array.reshape(n, -1))

@@ -69,7 +69,7 @@ def record_sweep(
     # Results of 0.1 name the clock; a result without one would be of the continuous clock, the default then.
     run = {**simulation, "clock": work.kind.settings.clock}
     document = {
-        "what": "closed-loop trajectories of many starts" if save_every else "metrics of many closed-loop runs",
+        "what": "closed-loop trajectories of many initial states" if save_every else "metrics of many closed-loop runs",
         "versions": files.versions(),
         "about": dict(about or {}),
         "run": {key: value for key, value in run.items() if value is not None},

@@ -31,7 +31,7 @@ def test_it_writes_the_metrics_of_every_start_a_summary_and_a_picture(precision,
     assert document["plant"] == io.encode(plant)
     assert (tmp_path / "sweep.png").read_bytes().startswith(b"\x89PNG")
     text = capsys.readouterr().out
-    assert "of 6 starts settle" in text
+    assert "of 6 initial states settle" in text
     assert "M steps/s" not in text  # that is the progress bar's
 
 

@@ -74,7 +74,9 @@ def reference_points(plant: CartPole, plan: FrontConfig, supplies: tuple[float, 
         points = points[np.isfinite(points[:, 0])]
         if not len(points) and objective[0] == own:
             raise InputError(
-                "plant.motor.voltage_limit", own, "enough for the baseline controller to settle from half of the starts"
+                "plant.motor.voltage_limit",
+                own,
+                "enough for the baseline controller to settle from half of the initial states",
             )
         reference[objective] = 1.1 * np.max(points, axis=0) if len(points) else reference[own, objective[1]]
     return ReferencePoints(baseline, reference)
