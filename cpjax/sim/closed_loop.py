@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from cpjax.backend.single_kernel import outline
 from cpjax.checks import call, integer, real
@@ -28,9 +29,9 @@ GATE_CROSSING = GATE + 1
 class Mode(NamedTuple):
     """Mode in which the closed loop is smooth, on the continuous clock."""
 
-    law: jax.Array
+    law: Int[Array, ""]
     """The controller's mode, int32."""
-    clip: jax.Array
+    clip: Int[Array, ""]
     """Saturation of the demanded voltage: 1 above the upper limit, -1 below the lower one, 0 inside, int32."""
     plant: Tree
     """The plant's own mode."""
@@ -44,6 +45,7 @@ class ContinuousLoop(NamedTuple):
     """
 
     plant: Any
+    """A `Plant` that also has an `input_limit`."""
     controller: SmoothController
 
     def observe(self, q: Tree, v: Tree, mode: Mode) -> Observation:
@@ -61,7 +63,7 @@ class ContinuousLoop(NamedTuple):
         )
         return Observation(plant_accelerations(self.plant, q, v, u, mode.plant), guards, u)
 
-    def jump(self, q: Tree, v: Tree, mode: Mode, guard: jax.Array) -> tuple[Tree, Tree, Mode]:
+    def jump(self, q: Tree, v: Tree, mode: Mode, guard: Int[Array, ""]) -> tuple[Tree, Tree, Mode]:
         state = plants.state_of(self.plant, q, v)
         successor = integer("controller.successor", call("controller", self.controller, "successor", mode.law))
         law = jnp.where(guard == GATE, successor, mode.law)
@@ -87,18 +89,18 @@ class ContinuousLoop(NamedTuple):
         law = integer("controller.start_mode", call("controller", self.controller, "start_mode", start))
         return Mode(law, self._clip(start, law), plants.start_mode(self.plant, *plants.coordinates(self.plant, start)))
 
-    def _clip(self, state: Tree, law: jax.Array) -> jax.Array:
+    def _clip(self, state: Tree, law: Int[Array, ""]) -> Int[Array, ""]:
         demanded, limit = self._demand(state, law), self.plant.input_limit
         return (demanded > limit).astype(jnp.int32) - (demanded < -limit).astype(jnp.int32)
 
-    def _demand(self, state: Tree, law: jax.Array) -> jax.Array:
+    def _demand(self, state: Tree, law: Int[Array, ""]) -> Float[Array, ""]:
         return demand(self.controller, state, law)
 
 
 class HeldMode(NamedTuple):
     """Mode in which the plant is smooth between two control instants."""
 
-    u: jax.Array
+    u: Float[Array, ""]
     """The held input."""
     plant: Tree
     """The plant's own mode."""
@@ -113,7 +115,7 @@ class HeldLoop(NamedTuple):
         guards = plant_guards(self.plant, q, v, mode.u, mode.plant)
         return Observation(plant_accelerations(self.plant, q, v, mode.u, mode.plant), guards, mode.u)
 
-    def jump(self, q: Tree, v: Tree, mode: HeldMode, guard: jax.Array) -> tuple[Tree, Tree, HeldMode]:
+    def jump(self, q: Tree, v: Tree, mode: HeldMode, guard: Int[Array, ""]) -> tuple[Tree, Tree, HeldMode]:
         q, v, of_plant = plant_jump(self.plant, q, v, mode.plant, guard)
         return q, v, mode._replace(plant=of_plant)
 
@@ -121,13 +123,13 @@ class HeldLoop(NamedTuple):
 System: TypeAlias = ContinuousLoop | HeldLoop
 
 
-def plant_accelerations(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Tree:
+def plant_accelerations(plant: Plant, q: Tree, v: Tree, u: Float[Array, ""], mode: Tree) -> Tree:
     """Returns the accelerations q'' under the input `u`, in the plant's own mode."""
     geometry = plants.geometry(plant, q)
     return outline(plants.accelerations)(plant, geometry, v, u, mode)
 
 
-def plant_guards(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Guards:
+def plant_guards(plant: Plant, q: Tree, v: Tree, u: Float[Array, ""], mode: Tree) -> Guards:
     """Returns the plant's own guards, () for a plant without events.
 
     Raises:
@@ -141,7 +143,7 @@ def plant_guards(plant: Plant, q: Tree, v: Tree, u: jax.Array, mode: Tree) -> Gu
     return tuple(real(f"plant.guards[{i}]", guard, u.dtype) for i, guard in enumerate(guards))
 
 
-def plant_jump(plant: Any, q: Tree, v: Tree, mode: Tree, guard: jax.Array) -> tuple[Tree, Tree, Tree]:
+def plant_jump(plant: Any, q: Tree, v: Tree, mode: Tree, guard: Int[Array, ""]) -> tuple[Tree, Tree, Tree]:
     """Returns positions, velocities and the plant's mode after its own guard of this number (int32) has fallen.
 
     Raises:

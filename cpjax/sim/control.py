@@ -1,63 +1,67 @@
 """The controller in the loop: its memory, and the input that the drive applies for its command."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float, Int
 
 from cpjax.checks import arrays, call, integer, like, pair, real
 from cpjax.controllers.protocol import ModeMemory, as_sampled, modes_in, start_memory
 from cpjax.pytree import cast
 from cpjax.sim import plants
 from cpjax.sim.derivatives import difference, holding, shift_of, shifted, tracked, with_zeros
-from cpjax.sim.plants import Plant, Tree
+from cpjax.sim.plants import Plant, PlantState
 from cpjax.sim.settings import Settings
 from cpjax.sim.stepper import applied_voltage, dtype_of
+
+Memory: TypeAlias = Any
+"""A controller's memory: any pytree of arrays."""
 
 
 class Blend(NamedTuple):
     """Quantities of one control period that the derivative of the mean needs; see `derivatives.py`."""
 
-    held: jax.Array
+    held: Float[Array, ""]
     """Voltage that would be applied, had the controller's mode not changed."""
-    shift: jax.Array
+    shift: Float[Array, ""]
     """Shift of that change of mode, as a fraction of the period: value 0, with a derivative."""
-    voltage_echo: jax.Array
+    voltage_echo: Float[Array, ""]
     """Contribution to the voltage of the change of mode in the previous period: value 0, with a derivative."""
-    memory_echo: tuple[jax.Array, ...]
+    memory_echo: tuple[Float[Array, "..."], ...]
     """Contribution of this period's change of mode to the memory in the next one: zeros, with a derivative."""
-    mode: jax.Array
+    mode: Int[Array, ""]
     """Mode until this period, int32."""
 
 
 class Control(NamedTuple):
     """Memory and voltage of the controller from a control instant on."""
 
-    memory: Any
-    voltage: jax.Array
+    memory: Memory
+    voltage: Float[Array, ""]
     """Input that the drive applies [V]."""
     blend: Blend | None = None
     """None unless the derivative of the mean is requested."""
 
     @property
-    def applied(self) -> jax.Array:
+    def applied(self) -> Float[Array, ""]:
         """Voltage with the derivative that the plant receives [V]."""
         if self.blend is None:
             return self.voltage
         return shifted(self.voltage, self.blend.held, 1.5 * self.blend.shift) + self.blend.voltage_echo
 
     @property
-    def mode(self) -> jax.Array:
+    def mode(self) -> Int[Array, ""]:
         """Mode that a trajectory records: the first one in the memory, 0 if there is none."""
         modes = modes_in(self.memory)
         return modes[0].mode if modes else jnp.asarray(0, dtype=jnp.int32)
 
 
-def start_control(plant: Plant, controller: Any, start: Tree, settings: Settings) -> Control:
+def start_control(plant: Plant, controller: Any, start: PlantState, settings: Settings) -> Control:
     """Returns the memory before the controller's first update, and the voltage after it."""
     if settings.clock == "continuous":
-        memory: Any = start_memory(controller, start)
+        memory: Memory = start_memory(controller, start)
     else:
         firmware = as_sampled(tracked(controller) if settings.derivative == "mean" else controller)
         memory = cast(arrays("controller.init: memory", call("controller", firmware, "init", start)), dtype_of(start))
@@ -70,7 +74,7 @@ def start_control(plant: Plant, controller: Any, start: Tree, settings: Settings
     return Control(memory, first.voltage, nothing._replace(held=first.voltage, mode=mode))
 
 
-def update_control(plant: Plant, controller: Any, before: Control, state: Tree, settings: Settings) -> Control:
+def update_control(plant: Plant, controller: Any, before: Control, state: PlantState, settings: Settings) -> Control:
     """Runs the controller at a control instant."""
     memory = before.memory
     if settings.clock == "continuous":
@@ -95,7 +99,7 @@ def update_control(plant: Plant, controller: Any, before: Control, state: Tree, 
     return Control(memory, voltage, Blend(held, shift, echo, shifted(zeros, gap, -0.5 * shift), before.mode))
 
 
-def _updated(controller: Any, memory: Any, state: Tree) -> tuple[Any, jax.Array]:
+def _updated(controller: Any, memory: Memory, state: PlantState) -> tuple[Memory, Float[Array, ""]]:
     returned = call("controller", controller, "update", memory, state)
     updated, command = pair("controller.update", returned, "the new memory and the command")
     dtype = dtype_of(state)

@@ -32,6 +32,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from cpjax.checks import arrays, call, integer, real
 from cpjax.controllers.hybrid import Hybrid
@@ -104,7 +105,7 @@ def holding(controller: Any) -> Any:
     return _replaced(controller, Holding)
 
 
-def shift_of(memory: Any) -> jax.Array:
+def shift_of(memory: Any) -> Float[Array, ""]:
     """Returns the shift of a change of mode at this instant, in control periods: value 0, with a derivative.
 
     Raises:
@@ -120,7 +121,7 @@ def shift_of(memory: Any) -> jax.Array:
 
 
 @jax.custom_jvp
-def _moved_crossing(before: jax.Array, after: jax.Array, crossed: jax.Array) -> jax.Array:
+def _moved_crossing(before: Float[Array, ""], after: Float[Array, ""], crossed: Bool[Array, ""]) -> Float[Array, ""]:
     """Returns 0 with, where `crossed`, the derivative of the crossing's position in the period between the two margins,
     `before / (before - after)`."""
     return jnp.where(crossed, jnp.zeros_like(before), jnp.zeros_like(before))
@@ -135,7 +136,7 @@ def _moved_crossing_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 @jax.custom_jvp
-def shifted(new: Any, old: Any, shift: jax.Array) -> Any:
+def shifted(new: Any, old: Any, shift: Float[Array, ""]) -> Any:
     """Returns `new` with the derivative of `(1 - shift) * new + shift * old` at `shift` = 0.
 
     Args:
@@ -150,7 +151,7 @@ def _shifted_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     new, old, shift = primals
     d_new, _, d_shift = tangents
 
-    def moved(new: jax.Array, old: jax.Array, tangent: Any) -> Any:
+    def moved(new: Shaped[Array, "..."], old: Shaped[Array, "..."], tangent: Any) -> Any:
         if not jnp.issubdtype(jnp.asarray(new).dtype, jnp.floating):
             return tangent
         jump = _once(old - new)  # NaN for two infinities, such as a settling time that is not known yet
@@ -160,7 +161,7 @@ def _shifted_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
 
 
 @jax.custom_jvp
-def _once(jump: jax.Array) -> jax.Array:
+def _once(jump: Float[Array, "*leaf"]) -> Float[Array, "*leaf"]:
     """Returns its argument; raises InputError when differentiated, as second derivatives are not supported."""
     return jump
 
@@ -171,7 +172,7 @@ def _once_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     raise InputError("derivative", "mean", allowed)
 
 
-def difference(held: Any, updated: Any) -> tuple[jax.Array, ...]:
+def difference(held: Any, updated: Any) -> tuple[Float[Array, "..."], ...]:
     """Returns, for each float leaf of a controller's memory, the value with the mode held minus the updated value.
 
     `ModeMemory` nodes are left out: mode and margin belong to the mode that was chosen.
@@ -180,7 +181,7 @@ def difference(held: Any, updated: Any) -> tuple[jax.Array, ...]:
     return tuple(a - b for a, b in pairs if _is_float(b))
 
 
-def with_zeros(memory: Any, zeros: tuple[jax.Array, ...]) -> Any:
+def with_zeros(memory: Any, zeros: tuple[Float[Array, "..."], ...]) -> Any:
     """Returns a memory with zeros added to its float leaves for their derivatives, in the order of `difference`."""
     left = iter(zeros)
     parts = [part + next(left) if _is_float(part) else part for part in _parts(memory)]
@@ -252,7 +253,7 @@ def _watched_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return primals[0], tangents[0]
 
 
-def _margin(controller: SmoothController, state: Any, mode: jax.Array) -> jax.Array:
+def _margin(controller: SmoothController, state: Any, mode: Int[Array, ""]) -> Float[Array, ""]:
     dtype = jnp.asarray(jax.tree.leaves(state)[0]).dtype
     return real("controller.margin", call("controller", controller, "margin", state, mode), dtype)
 

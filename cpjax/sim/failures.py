@@ -13,18 +13,19 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Int
 
 from cpjax.backend.single_kernel import outline
 from cpjax.pytree import Scalar
 from cpjax.sim import plants
 from cpjax.sim.flags import STOPPED, Flag
-from cpjax.sim.plants import Plant, Tree
+from cpjax.sim.plants import Plant, PlantState, Tree
 
 
 class Outlook(NamedTuple):
     """Prediction about a step before it is taken."""
 
-    possible: jax.Array
+    possible: Bool[Array, ""]
     """Whether an Euler step keeps the velocities within the plant's limits."""
     ahead: Tree
     """Velocities after an Euler step."""
@@ -36,22 +37,22 @@ def look_ahead(plant: Plant, v: Tree, acceleration: Tree, dt: Scalar) -> Outlook
     return Outlook(plants.within(ahead, plants.coordinates(plant, plant.limits)[1]), ahead)
 
 
-def is_stopped(flag: jax.Array) -> jax.Array:
+def is_stopped(flag: Int[Array, ""]) -> Bool[Array, ""]:
     """Returns whether a flag has stopped the run."""
     return (flag & STOPPED) != 0
 
 
-def safe(going: jax.Array, tree: Any) -> Any:
+def safe(going: Bool[Array, ""], tree: Any) -> Any:
     """Returns the tree where the run continues, and zeros where it does not."""
     return jax.tree.map(lambda value: jnp.where(going, value, jnp.zeros((), jnp.asarray(value).dtype)), tree)
 
 
-def verdict(plant: Plant, after: Tree, outlook: Outlook) -> tuple[jax.Array, jax.Array]:
+def verdict(plant: Plant, after: PlantState, outlook: Outlook) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Returns whether the state after a step is within the limits, and the flag for a step that is not."""
     within, finite = outline(_judged)(after, outlook.ahead, plant.limits)
     return within, jnp.where(finite, np.int32(Flag.RUNAWAY), np.int32(Flag.NON_FINITE))
 
 
-def _judged(after: Tree, ahead: Tree, limits: Tree) -> tuple[jax.Array, jax.Array]:
+def _judged(after: PlantState, ahead: Tree, limits: PlantState) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     total = sum(jax.tree.leaves(ahead)) + sum(jax.tree.leaves(after))
     return plants.within(after, limits), jnp.isfinite(total)

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from cpjax.pytree import is_number
 
@@ -37,18 +38,18 @@ NEEDS_RECOMPUTE = 1 << 30
 """Internal bit beside the flags: `sweep` recomputes such a run without the fast path; see `Settings.fast_path`."""
 
 
-def describe(flag: int) -> str:
+def describe(flag: Int[ArrayLike, ""]) -> str:
     """Returns the flag in words, such as "runaway" or "clean"."""
     names = [bit.name.lower().replace("_", "-") for bit in Flag if int(np.asarray(flag)) & bit and bit.name]
     return ", ".join(names) or "clean"
 
 
-def nonfinite_flag(tree: Any) -> jax.Array:
+def nonfinite_flag(tree: Any) -> Int[Array, ""]:
     """Returns NON_FINITE if a number of the tree is NaN, else 0; int32."""
     leaves = jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(tree) if is_number(leaf)])
     return jnp.where(jnp.any(leaves), int(Flag.NON_FINITE), 0).astype(jnp.int32)
 
 
-def nonfinite_input(voltage: jax.Array) -> jax.Array:
+def nonfinite_input(voltage: Float[Array, ""]) -> Int[Array, ""]:
     """Returns the flag of a run whose applied input is not finite, else 0."""
     return jnp.where(jnp.isfinite(voltage), np.int32(0), np.int32(Flag.NON_FINITE))

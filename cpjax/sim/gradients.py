@@ -8,27 +8,27 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool, Float
 
 from cpjax.errors import InputError
 from cpjax.plant.state import State
 from cpjax.sim.initial import checked_tree
 
 Direction: TypeAlias = Literal["reverse", "forward"]
-Objective: TypeAlias = Callable[[Any, State], jax.Array]
+Objective: TypeAlias = Callable[[Any, State], Float[Array, ""]]
 """Function of parameters and one initial state that returns a scalar, such as an entry of `cpjax.measure`'s result."""
 
 
 class Gradients(NamedTuple):
     """Value and gradient of an objective at each of n initial states."""
 
-    value: jax.Array
-    """Shape (n,)."""
+    value: Float[Array, "*batch"]
     gradient: Any
-    """Tree of the parameters' structure, each leaf with a leading axis n."""
+    """Tree of the parameters' structure, each leaf with the leading axis of `value`."""
 
     @property
-    def finite(self) -> jax.Array:
-        """Returns whether the value and all numbers of the gradient are finite (n,).
+    def finite(self) -> Bool[Array, " starts"]:
+        """Returns whether the value and all numbers of the gradient are finite.
 
         A derivative can overflow where the run itself is clean: exactly upright at rest, a perturbation grows by
         powers of ten every second, in float32 soon beyond the largest number. No flag of the run reports this.

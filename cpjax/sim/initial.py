@@ -11,13 +11,21 @@ import numpy as np
 
 from cpjax.errors import InputError
 from cpjax.pytree import as_array, is_traced
-from cpjax.sim.plants import Plant
+from cpjax.sim.plants import Plant, PlantState
 
 _LARGEST = sys.float_info.max
 
 
-def checked_initial(plant: Plant, start: Any, field: str, *, batched: bool) -> tuple[Any, Any, int | None]:
+def checked_initial(
+    plant: Plant, start: PlantState, field: str, *, batched: bool
+) -> tuple[PlantState, np.dtype, int | None]:
     """Returns `start` as arrays of one dtype, that dtype, and the number of initial states (None if not `batched`).
+
+    Args:
+      plant: the plant, whose limits the initial states must respect.
+      start: one initial state of scalars or, if `batched`, many, of arrays (n,).
+      field: name of the argument in error messages.
+      batched: whether `start` holds many initial states.
 
     Raises:
       InputError: as `checked_tree` does.
@@ -27,13 +35,14 @@ def checked_initial(plant: Plant, start: Any, field: str, *, batched: bool) -> t
 
 
 def checked_tree(
-    start: Any, limits: Any, units: dict[str, str], field: str, *, batched: bool
-) -> tuple[Any, Any, int | None]:
+    start: PlantState, limits: PlantState, units: dict[str, str], field: str, *, batched: bool
+) -> tuple[PlantState, np.dtype, int | None]:
     """Returns a state as arrays of one dtype, that dtype, and the batch length (None if not `batched`).
 
     Python numbers take the dtype of the arrays beside them, or JAX's default float if there are none.
 
     Args:
+      start: the state.
       limits: the largest magnitude of each component, of the structure that `start` must have.
       units: of the components by name, for error messages.
       field: name of the argument in error messages.

@@ -5,16 +5,25 @@ substituting it into the classical methods removes half of their stage values an
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import jax
+import numpy as np
+from jaxtyping import Array, Float
 
 from cpjax.pytree import Scalar
 
 Tree: TypeAlias = Any
+"""Positions or velocities: any pytree of arrays."""
+
 Acceleration: TypeAlias = Callable[[Tree, Tree], Tree]
+"""Function from positions and velocities to accelerations."""
+
+Step: TypeAlias = Float[Array | np.ndarray, ""]
+"""Length of a step [s]; NumPy's until JAX traces it."""
 
 
+@runtime_checkable
 class Integrator(Protocol):
     """Interface of one step from (q, v) at t to (q, v) at t + dt; `first` is acceleration(q, v) if already known."""
 

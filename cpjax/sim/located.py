@@ -7,11 +7,12 @@ is held between control instants, so that only the plant's own events remain.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from cpjax.backend.single_kernel import outline, single_kernel
 from cpjax.errors import InputError
@@ -19,10 +20,10 @@ from cpjax.sim import failures, plants
 from cpjax.sim.closed_loop import GATE_CROSSING, ContinuousLoop, HeldLoop, HeldMode, System
 from cpjax.sim.control import Control, start_control, update_control
 from cpjax.sim.flags import CHATTER_LENGTH, Flag, nonfinite_flag, nonfinite_input
-from cpjax.sim.integrators import INTEGRATORS, Integrator
-from cpjax.sim.metrics import Fold, Sample
+from cpjax.sim.integrators import INTEGRATORS, Integrator, Step
+from cpjax.sim.metrics import Fold, MetricState, Sample
 from cpjax.sim.per_step import finish_metric, sees_the_voltage, start_metric, update_metric
-from cpjax.sim.plants import Plant, Tree
+from cpjax.sim.plants import Plant, PlantState
 from cpjax.sim.saved import pack
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
@@ -33,20 +34,23 @@ class _Loop(NamedTuple):
     """Carry of the scan."""
 
     motion: Motion
-    flag: jax.Array
-    voltage: jax.Array
+    flag: Int[Array, ""]
+    voltage: Float[Array, ""]
     """Voltage at the previous sample [V]."""
-    mode: jax.Array
+    mode: Int[Array, ""]
     """Mode at the previous sample."""
     control: Control | None
     """Controller on the sampled clock, else None."""
-    changes: jax.Array
+    changes: Int[Array, ""]
     """Number of consecutive control instants at which the mode changed, on the sampled clock."""
 
 
+_Carry: TypeAlias = tuple[_Loop, MetricState]
+
+
 def simulate(
-    start: Tree, plant: Plant, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
-) -> tuple[jax.Array | None, Sample, Any]:
+    start: PlantState, plant: Plant, controller: Any, fold: Fold, dt: Step, settings: Settings
+) -> tuple[Float[Array, "rows columns"] | None, Sample, Any]:
     """Simulates one initial state; see `cpjax.sim.rollout.simulate`."""
     q, v = plants.coordinates(plant, start)
     flag = nonfinite_flag((start, plant, controller))
@@ -86,15 +90,15 @@ def simulate(
 
 
 def _run(
-    carry: tuple[_Loop, Any], plant: Plant, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
-) -> tuple[tuple[_Loop, Any], tuple[jax.Array, jax.Array] | None]:
+    carry: _Carry, plant: Plant, controller: Any, fold: Fold, dt: Step, settings: Settings
+) -> tuple[_Carry, tuple[Float[Array, "iterations columns"], Int[Array, " iterations"]] | None]:
     """Returns loop and metric state after all iterations and, if samples are saved, the packed sample of each iteration
     with the number of grid points passed."""
     iterations = settings.steps + settings.spare_steps
 
     def body(
-        carry: tuple[_Loop, Any], index: jax.Array
-    ) -> tuple[tuple[_Loop, Any], tuple[jax.Array, jax.Array] | None]:
+        carry: _Carry, index: Int[Array, ""]
+    ) -> tuple[_Carry, tuple[Float[Array, " columns"], Int[Array, ""]] | None]:
         before, memory = carry
         loop, reached = _advance(plant, controller, before, dt, settings, iterations - index)
         sample = _sample(plant, loop, before.motion, dt)
@@ -108,13 +112,13 @@ def _run(
     return scan(body, carry, jnp.arange(iterations, dtype=jnp.int32), settings.checkpoint)
 
 
-def _law(motion: Motion, control: Control | None) -> jax.Array:
+def _law(motion: Motion, control: Control | None) -> Int[Array, ""]:
     """Returns the controller's mode."""
-    law: jax.Array = motion.mode.law if control is None else control.mode
+    law: Int[Array, ""] = motion.mode.law if control is None else control.mode
     return law
 
 
-def _sample(plant: Plant, loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
+def _sample(plant: Plant, loop: _Loop, before: Motion, dt: Step) -> Sample:
     """Returns the sample at the last point that was reached; `before` is the motion one iteration earlier."""
     motion = loop.motion
     held = isinstance(motion.mode, HeldMode)
@@ -122,7 +126,7 @@ def _sample(plant: Plant, loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
     state = plants.state_of(plant, motion.q, motion.v)
     return Sample(
         time=motion.passed.astype(dt.dtype) * dt + motion.offset,
-        elapsed=motion.elapsed,
+        elapsed=jnp.asarray(motion.elapsed),
         state=state,
         voltage=motion.seen.output,
         voltage_since=loop.voltage,
@@ -138,8 +142,8 @@ def _sample(plant: Plant, loop: _Loop, before: Motion, dt: jax.Array) -> Sample:
 
 
 def _advance(
-    plant: Plant, controller: Any, loop: _Loop, dt: jax.Array, settings: Settings, left: jax.Array
-) -> tuple[_Loop, jax.Array]:
+    plant: Plant, controller: Any, loop: _Loop, dt: Step, settings: Settings, left: Int[Array, ""]
+) -> tuple[_Loop, Bool[Array, ""]]:
     """Performs one iteration. A run that fails, or cannot end within the iterations that are left, is held at the last
     point and flagged (see `failures.py`); its samples continue."""
     integrator: Integrator = INTEGRATORS[settings.integrator]
@@ -172,7 +176,7 @@ def _advance(
 
 
 def _control(
-    plant: Plant, controller: Any, system: System, loop: _Loop, instant: jax.Array, settings: Settings
+    plant: Plant, controller: Any, system: System, loop: _Loop, instant: Bool[Array, ""], settings: Settings
 ) -> _Loop:
     """Updates the controller on the sampled clock, if this is a control instant."""
     motion = loop.motion

@@ -6,11 +6,11 @@ million initial states fit in memory.
 """
 
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from cpjax.backend.extremes import fast_maximum, fast_minimum
 from cpjax.backend.trigonometry import sin_cos
@@ -18,47 +18,51 @@ from cpjax.errors import InputError
 from cpjax.numeric.angles import wrap_angle
 from cpjax.pytree import Scalar, number, pytree
 from cpjax.sim.flags import STOPPED
+from cpjax.sim.plants import PlantState, Tree
+
+MetricState: TypeAlias = Any
+"""State of a metric between two samples: any pytree of arrays."""
 
 
 class Sample(NamedTuple):
     """The closed loop at one instant."""
 
-    time: jax.Array
+    time: Float[Array, ""]
     """Time since the start of the rollout [s]."""
-    elapsed: jax.Array
+    elapsed: Float[Array, ""]
     """Time since the previous sample [s]; 0 at the first, and after a flag has stopped the run."""
-    state: Any
+    state: PlantState
     """State of the plant."""
-    voltage: jax.Array
+    voltage: Float[Array, ""]
     """Input applied from this sample on, clipped [V]."""
-    voltage_since: jax.Array
+    voltage_since: Float[Array, ""]
     """Input applied right after the previous sample [V]; at the first sample equal to `voltage`."""
-    voltage_until: jax.Array | None
+    voltage_until: Float[Array, ""] | None
     """Input applied right before this sample [V]: the law of the mode until now at this state. None on the sampled
     clock, where a held voltage has not changed since the previous sample."""
-    mode: jax.Array
+    mode: Int[Array, ""]
     """Mode from this sample on."""
-    mode_before: jax.Array
+    mode_before: Int[Array, ""]
     """Mode from the previous sample until this one."""
-    outputs: dict[str, jax.Array]
+    outputs: dict[str, Float[Array, ""]]
     """Further outputs of the plant from this sample on, by name; for a `CartPole`, `cart_acceleration` [m/s^2]."""
-    plant_mode: Any
+    plant_mode: Tree
     """The plant's own mode from this sample on; () for a plant without modes."""
-    flag: jax.Array
+    flag: Int[Array, ""]
     """Bits of `Flag`."""
-    crossing: jax.Array
+    crossing: Int[Array, ""]
     """Event located at this sample, int32: 0 none, 1 and 2 the upper and the lower voltage limit, 3 the gate; from 4 on
     the plant's own events."""
-    crossing_speed: jax.Array
+    crossing_speed: Float[Array, ""]
     """Rate at which that guard (relative voltage, gate margin, plant's guard) fell [its unit/s]; 0 without an event."""
 
     @property
-    def voltage_before(self) -> jax.Array:
+    def voltage_before(self) -> Float[Array, ""]:
         """Input applied right before this sample [V], on either clock."""
         return self.voltage_since if self.voltage_until is None else self.voltage_until
 
     @property
-    def cart_acceleration(self) -> jax.Array:
+    def cart_acceleration(self) -> Float[Array, ""]:
         """x'' of a cart-pole from this sample on [m/s^2]."""
         if "cart_acceleration" not in self.outputs:
             names = ", ".join(self.outputs) or "none"
@@ -66,20 +70,25 @@ class Sample(NamedTuple):
         return self.outputs["cart_acceleration"]
 
 
+@runtime_checkable
 class Fold(Protocol):
     """Interface of a metric, a streaming reduction over samples. A pytree: its numbers may be traced."""
 
-    def init(self, sample: Sample) -> Any:
+    def init(self, sample: Sample) -> MetricState:
         """Returns the metric state before the first update: any pytree of arrays."""
         ...
 
-    def update(self, memory: Any, sample: Sample) -> Any:
+    def update(self, memory: MetricState, sample: Sample) -> MetricState:
         """Returns the metric state after `sample`, of the same structure, shapes and dtypes."""
         ...
 
-    def finish(self, memory: Any, last: Sample) -> Any:
+    def finish(self, memory: MetricState, last: Sample) -> Any:
         """Returns the result from the final metric state and the last sample."""
         ...
+
+
+Integral: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]
+"""State of a metric that integrates by the trapezoidal rule: the integral so far, and the integrand now."""
 
 
 @pytree
@@ -98,7 +107,7 @@ class NoMetrics:
 
 @pytree
 class Metrics:
-    """Metrics of the evaluation protocol for one rollout; after a sweep, arrays of shape (n,).
+    """Metrics of the evaluation protocol for one rollout; after a sweep, those of all its initial states.
 
     Attributes:
       success: settled at least `hold` before the end, |x| never beyond `track_limit`, and not stopped by a flag.
@@ -113,15 +122,15 @@ class Metrics:
       flag: bits of `Flag`.
     """
 
-    success: jax.Array
-    settling_time: jax.Array
-    cart_travel: jax.Array
-    effort: jax.Array
-    voltage_variation: jax.Array
-    peak_voltage: jax.Array
-    peak_cart_acceleration: jax.Array
-    switches: jax.Array
-    flag: jax.Array
+    success: Bool[Array, "*batch"]
+    settling_time: Float[Array, "*batch"]
+    cart_travel: Float[Array, "*batch"]
+    effort: Float[Array, "*batch"]
+    voltage_variation: Float[Array, "*batch"]
+    peak_voltage: Float[Array, "*batch"]
+    peak_cart_acceleration: Float[Array, "*batch"]
+    switches: Int[Array, "*batch"]
+    flag: Int[Array, "*batch"]
 
 
 @pytree
@@ -137,31 +146,31 @@ class TimeOutside:
     position_width: Scalar = number("m", "of the target", default=0.2, above=0.0)
     reference_x: Scalar = number("m", "where the cart is to settle", default=0.0)
 
-    def init(self, sample: Sample) -> tuple[jax.Array, jax.Array]:
+    def init(self, sample: Sample) -> Integral:
         return jnp.zeros_like(sample.time), self._outside(sample)
 
-    def update(self, memory: tuple[jax.Array, jax.Array], sample: Sample) -> tuple[jax.Array, jax.Array]:
+    def update(self, memory: Integral, sample: Sample) -> Integral:
         total, before = memory
         now = self._outside(sample)
         return total + 0.5 * sample.elapsed * (before + now), now
 
-    def finish(self, memory: tuple[jax.Array, jax.Array], last: Sample) -> jax.Array:
+    def finish(self, memory: Integral, last: Sample) -> Float[Array, ""]:
         return memory[0]
 
-    def _outside(self, sample: Sample) -> jax.Array:
+    def _outside(self, sample: Sample) -> Float[Array, ""]:
         _, cos = sin_cos(sample.state.theta)
         away = (sample.state.x - self.reference_x) / self.position_width
         return 1.0 - jnp.exp(-(1.0 - cos) / (self.angle_width * self.angle_width) - 0.5 * away * away)
 
 
 class _Memory(NamedTuple):
-    entered: jax.Array
-    cart_travel: jax.Array
-    effort: jax.Array
-    voltage_variation: jax.Array
-    peak_voltage: jax.Array
-    peak_cart_acceleration: jax.Array
-    switches: jax.Array
+    entered: Float[Array, ""]
+    cart_travel: Float[Array, ""]
+    effort: Float[Array, ""]
+    voltage_variation: Float[Array, ""]
+    peak_voltage: Float[Array, ""]
+    peak_cart_acceleration: Float[Array, ""]
+    switches: Int[Array, ""]
 
 
 @pytree

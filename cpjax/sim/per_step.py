@@ -6,12 +6,13 @@ continuous clock every step is a control instant for the mode, and the law of th
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
+from jaxtyping import Array, Float, Int
 
 from cpjax.backend import runtime
 from cpjax.backend.single_kernel import outline, single_kernel
@@ -21,9 +22,9 @@ from cpjax.sim import failures, plants
 from cpjax.sim.control import Control, start_control, update_control
 from cpjax.sim.derivatives import shifted, warn_of_memory
 from cpjax.sim.flags import CHATTER_LENGTH, NEEDS_RECOMPUTE, Flag, nonfinite_flag, nonfinite_input
-from cpjax.sim.integrators import INTEGRATORS
-from cpjax.sim.metrics import Fold, Sample
-from cpjax.sim.plants import Plant, Tree
+from cpjax.sim.integrators import INTEGRATORS, Step
+from cpjax.sim.metrics import Fold, MetricState, Sample
+from cpjax.sim.plants import Plant, PlantState, Tree
 from cpjax.sim.saved import pack
 from cpjax.sim.scan import scan
 from cpjax.sim.settings import Settings
@@ -40,16 +41,19 @@ class _Instant(NamedTuple):
 class _Loop(NamedTuple):
     """Carry of the scan."""
 
-    state: Tree
+    state: PlantState
     control: Control
-    flag: jax.Array
-    changes: jax.Array
+    flag: Int[Array, ""]
+    changes: Int[Array, ""]
     """Number of consecutive control instants at which the mode changed."""
 
 
+_Carry: TypeAlias = tuple[_Loop, MetricState]
+
+
 def simulate(
-    start: Tree, plant: Plant, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
-) -> tuple[jax.Array | None, Sample, Any]:
+    start: PlantState, plant: Plant, controller: Any, fold: Fold, dt: Step, settings: Settings
+) -> tuple[Float[Array, "rows columns"] | None, Sample, Any]:
     """Simulates one initial state; see `cpjax.sim.rollout.simulate`."""
     control = start_control(plant, controller, start, settings)
     flag = nonfinite_flag((start, plant, controller))
@@ -75,12 +79,12 @@ def simulate(
 
 
 def _run(
-    carry: tuple[_Loop, Any], plant: Plant, controller: Any, fold: Fold, dt: jax.Array, settings: Settings
-) -> tuple[tuple[_Loop, Any], jax.Array | None]:
+    carry: _Carry, plant: Plant, controller: Any, fold: Fold, dt: Step, settings: Settings
+) -> tuple[_Carry, Float[Array, "rows columns"] | None]:
     """Returns loop and metric state after all steps, and the saved samples except the last."""
     steps, every = settings.steps, settings.save_every
 
-    def body(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], jax.Array | None]:
+    def body(carry: _Carry, index: Int[Array, ""]) -> tuple[_Carry, Float[Array, " columns"] | None]:
         before, memory = carry
         loop, sample, instant = _observe(plant, controller, before, index, dt, settings)
         memory = _fold(
@@ -89,7 +93,7 @@ def _run(
         saved = pack(_saved(plant, sample, loop)) if every == 1 else None
         return (_advance(plant, controller, loop, instant, dt, settings), memory), saved
 
-    def block(carry: tuple[_Loop, Any], index: jax.Array) -> tuple[tuple[_Loop, Any], jax.Array]:
+    def block(carry: _Carry, index: Int[Array, ""]) -> tuple[_Carry, Float[Array, " columns"]]:
         loop, sample, _ = _observe(plant, controller, carry[0], index, dt, settings)
         carry, _ = scan(body, carry, index + jnp.arange(every), "every_step")
         return carry, pack(_saved(plant, sample, loop))
@@ -105,15 +109,15 @@ def _run(
 
 def _fold(
     fold: Fold,
-    memory: Any,
+    memory: MetricState,
     sample: Sample,
     plant: Plant,
     before: Control,
     now: Control,
-    index: jax.Array,
+    index: Int[Array, ""],
     settings: Settings,
-    update: Callable[..., Any],
-) -> Any:
+    update: Callable[..., MetricState],
+) -> MetricState:
     """Returns the metric state after a sample, with the derivative of the mean if that is requested."""
     new = update(fold, memory, sample)
     if now.blend is None or before.blend is None or not sees_the_voltage(fold, memory, sample):
@@ -132,7 +136,7 @@ def _fold(
     return shifted(result, update(fold, memory, _completed(plant, begun)), jnp.where(instant, now.blend.shift, 0.0))
 
 
-def sees_the_voltage(fold: Fold, memory: Any, sample: Sample) -> bool:
+def sees_the_voltage(fold: Fold, memory: MetricState, sample: Sample) -> bool:
     """Returns whether a metric's update may depend on the voltage or the mode, also through the plant's outputs."""
 
     def update(voltages: Any) -> Any:
@@ -160,25 +164,25 @@ def _saved(plant: Plant, sample: Sample, loop: _Loop) -> Sample:
     return sample if loop.control.blend is None else _completed(plant, sample._replace(voltage=loop.control.applied))
 
 
-def update_metric(fold: Fold, memory: Any, sample: Sample) -> Any:
+def update_metric(fold: Fold, memory: MetricState, sample: Sample) -> MetricState:
     """Returns a metric's state after a sample."""
     updated = cast(arrays("metrics.update", call("metrics", fold, "update", memory, sample)), sample.time.dtype)
     return like("metrics.update", updated, memory)
 
 
-def start_metric(fold: Fold, first: Sample) -> Any:
+def start_metric(fold: Fold, first: Sample) -> MetricState:
     """Returns a metric's state before its first update, in the rollout's dtype."""
     begun = arrays("metrics.init", call("metrics", fold, "init", first))
     return jax.tree.map(jnp.asarray, cast(begun, first.time.dtype))
 
 
-def finish_metric(fold: Fold, memory: Any, last: Sample) -> Any:
+def finish_metric(fold: Fold, memory: MetricState, last: Sample) -> Any:
     """Returns the result of a metric."""
     return arrays("metrics.finish", call("metrics", fold, "finish", memory, last), keys=False)
 
 
 def _observe(
-    plant: Plant, controller: Any, loop: _Loop, index: jax.Array, dt: jax.Array, settings: Settings
+    plant: Plant, controller: Any, loop: _Loop, index: Int[Array, ""], dt: Step, settings: Settings
 ) -> tuple[_Loop, Sample, _Instant]:
     """Updates the controller at step `index`, if that is a control instant, takes a sample, and returns the
     accelerations at this instant, which are the first stage of `_advance`."""
@@ -218,7 +222,7 @@ def _observe(
     return _Loop(state, control, flag, changes), sample, _Instant(accelerations, geometry)
 
 
-def _advance(plant: Plant, controller: Any, loop: _Loop, instant: _Instant, dt: jax.Array, settings: Settings) -> _Loop:
+def _advance(plant: Plant, controller: Any, loop: _Loop, instant: _Instant, dt: Step, settings: Settings) -> _Loop:
     """Integrates one step; a failed run is held and flagged: see `failures.py`."""
     state, method = loop.state, INTEGRATORS[settings.integrator]
     first, geometry = instant

@@ -9,13 +9,17 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from cpjax.checks import call, like, pair, real
 from cpjax.errors import InputError
 from cpjax.pytree import Scalar, is_number, is_traced
 
 Tree: TypeAlias = Any
-"""A pytree of scalars."""
+"""A pytree of scalars, such as a plant's positions."""
+
+PlantState: TypeAlias = Any
+"""A state of a plant: of a `CartPole` a `State`, of another plant any pytree of scalars."""
 
 
 @runtime_checkable
@@ -27,15 +31,15 @@ class Plant(Protocol):
     """
 
     @property
-    def limits(self) -> Tree:
+    def limits(self) -> PlantState:
         """Largest allowed magnitude of each component, as a state; a run that exceeds one is stopped."""
         ...
 
-    def coordinates(self, state: Tree) -> tuple[Tree, Tree]:
+    def coordinates(self, state: PlantState) -> tuple[Tree, Tree]:
         """Returns positions and velocities (q, v) of a state."""
         ...
 
-    def state(self, q: Tree, v: Tree) -> Tree:
+    def state(self, q: Tree, v: Tree) -> PlantState:
         """Returns the state of these positions and velocities."""
         ...
 
@@ -61,7 +65,7 @@ class Geometric(Protocol):
         """Returns the functions of the positions that `accelerations` uses."""
         ...
 
-    def geometry_near(self, geometry: Tree, change: Tree) -> tuple[Tree, jax.Array]:
+    def geometry_near(self, geometry: Tree, change: Tree) -> tuple[Tree, Bool[Array, ""]]:
         """Returns the geometry at q + `change`, given that at q, and whether it is accurate to rounding.
 
         It must cost less than `geometry`, and may be inaccurate for large changes. `sweep` uses it for values only.
@@ -85,7 +89,7 @@ class Eventful(Protocol):
         """Returns scalars that are at least 0 while the mode lasts; a fixed number of them, smooth in q, v and u."""
         ...
 
-    def jump(self, q: Tree, v: Tree, mode: Tree, guard: jax.Array) -> tuple[Tree, Tree, Tree]:
+    def jump(self, q: Tree, v: Tree, mode: Tree, guard: Int[Array, ""]) -> tuple[Tree, Tree, Tree]:
         """Returns positions, velocities and mode after the guard of this number (int32) has fallen."""
         ...
 
@@ -117,7 +121,7 @@ def check_plant(plant: Any) -> None:
             raise InputError("plant", plant, f"one with all of {', '.join(together)}, or none of them")
 
 
-def coordinates(plant: Plant, state: Tree) -> tuple[Tree, Tree]:
+def coordinates(plant: Plant, state: PlantState) -> tuple[Tree, Tree]:
     """Returns (q, v) of a state."""
     q, v = pair("plant.coordinates", call("plant", plant, "coordinates", state), "positions and velocities")
     here, there = str(jax.tree.structure(q)), str(jax.tree.structure(v))
@@ -126,7 +130,7 @@ def coordinates(plant: Plant, state: Tree) -> tuple[Tree, Tree]:
     return q, v
 
 
-def state_of(plant: Plant, q: Tree, v: Tree) -> Tree:
+def state_of(plant: Plant, q: Tree, v: Tree) -> PlantState:
     """Returns the state of (q, v).
 
     Raises:
@@ -144,7 +148,7 @@ def geometry(plant: Plant, q: Tree) -> Tree:
     return call("plant", plant, "geometry", q) if isinstance(plant, Geometric) else q
 
 
-def geometry_near(plant: Plant, at: Tree, q: Tree, change: Tree) -> tuple[Tree, jax.Array]:
+def geometry_near(plant: Plant, at: Tree, q: Tree, change: Tree) -> tuple[Tree, Bool[Array, ""]]:
     """Returns the geometry at q, given the geometry `at` the positions q - `change`, and whether it is accurate."""
     if not isinstance(plant, Geometric):
         return q, jnp.asarray(True)
@@ -161,7 +165,7 @@ def accelerations(plant: Plant, geometry: Tree, v: Tree, u: Scalar, mode: Tree =
     return like("plant.accelerations", call("plant", plant, "accelerations", *arguments), v)
 
 
-def saturate(plant: Plant, command: jax.Array) -> jax.Array:
+def saturate(plant: Plant, command: Float[Array, ""]) -> Float[Array, ""]:
     """Returns the input that the drive applies for a command, in the command's dtype."""
     return real("plant.saturate", call("plant", plant, "saturate", command), command.dtype)
 
@@ -171,7 +175,7 @@ def start_mode(plant: Plant, q: Tree, v: Tree) -> Tree:
     return jax.tree.map(jnp.asarray, call("plant", plant, "start_mode", q, v)) if has_events(plant) else ()
 
 
-def outputs(plant: Plant, state: Tree, acceleration: Tree, u: Scalar) -> dict[str, Any]:
+def outputs(plant: Plant, state: PlantState, acceleration: Tree, u: Scalar) -> dict[str, Float[Array, ""]]:
     """Returns the scalars that the plant saves beside state and input, by name; none by default.
 
     Raises:
@@ -191,7 +195,7 @@ _TAKEN = frozenset({"time", "state", "voltage", "mode", "flag", "metrics", "outp
 """Names of a trajectory's own columns, which outputs must not have."""
 
 
-def within(tree: Tree, limits: Tree) -> jax.Array:
+def within(tree: Tree, limits: Tree) -> Bool[Array, ""]:
     """Returns whether every number of the tree is at most its limit in magnitude; False for NaN."""
     inside = jax.tree.map(lambda value, limit: jnp.abs(value) <= limit, tree, limits)
     return jax.tree.reduce(jnp.logical_and, inside)

@@ -9,6 +9,7 @@ from typing import Any, Unpack
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 from cpjax.controllers.feedback import without_design
 from cpjax.controllers.protocol import (
@@ -27,8 +28,9 @@ from cpjax.sim import located, per_step
 from cpjax.sim.derivatives import may_switch, watched
 from cpjax.sim.flags import NEEDS_RECOMPUTE
 from cpjax.sim.initial import checked_initial
+from cpjax.sim.integrators import Step
 from cpjax.sim.metrics import Fold, NoMetrics, ProtocolMetrics, Sample
-from cpjax.sim.plants import Plant, Tree, check_plant, has_events
+from cpjax.sim.plants import Plant, PlantState, check_plant, has_events
 from cpjax.sim.saved import SavedSamples, fields, keep
 from cpjax.sim.settings import Settings, Simulation, check_names, check_settings
 
@@ -38,34 +40,34 @@ class Trajectory:
     """Samples of a rollout, all of one length; the first is at t = 0, the last at the end.
 
     Attributes:
-      time: (n,) [s].
-      state: the plant's state, of (n,) arrays; of a `CartPole` a `State`, whose theta is not wrapped.
-      voltage: (n,) applied from that instant on, clipped [V].
-      mode: (n,) int32, of the controller, from that instant on.
-      outputs: further outputs of the plant by name, each (n,); of a `CartPole` `cart_acceleration`, x'' from that
-        instant on [m/s^2].
-      flag: () int32, bits of `Flag` for the whole run; 0 is clean.
+      time: since the start [s].
+      state: the plant's state, with the axes of `time`; of a `CartPole` a `State`, whose theta is not wrapped.
+      voltage: applied from that instant on, clipped [V].
+      mode: of the controller, from that instant on, int32.
+      outputs: further outputs of the plant by name; of a `CartPole` `cart_acceleration`, x'' from that instant on
+        [m/s^2].
+      flag: bits of `Flag` for the whole run, int32; 0 is clean.
       metrics: result of the metric, over every step whether saved or not.
     """
 
-    time: jax.Array
-    state: Any
-    voltage: jax.Array
-    mode: jax.Array
-    outputs: dict[str, jax.Array]
-    flag: jax.Array
+    time: Float[Array, "*batch samples"]
+    state: PlantState
+    voltage: Float[Array, "*batch samples"]
+    mode: Int[Array, "*batch samples"]
+    outputs: dict[str, Float[Array, "*batch samples"]]
+    flag: Int[Array, "*batch"]
     metrics: Any
 
     @property
-    def cart_acceleration(self) -> jax.Array:
-        """x'' of a cart-pole (n,), from that instant on [m/s^2]."""
+    def cart_acceleration(self) -> Float[Array, "*batch samples"]:
+        """x'' of a cart-pole, from that instant on [m/s^2]."""
         return self.outputs["cart_acceleration"]
 
 
 def rollout(
     plant: Plant,
     controller: Controller | ModalController | Law,
-    start: Tree,
+    start: PlantState,
     *,
     metrics: Fold | None = None,
     **simulation: Unpack[Simulation],
@@ -102,7 +104,7 @@ def rollout(
 def measure(
     plant: Plant,
     controller: Controller | ModalController | Law,
-    start: Tree,
+    start: PlantState,
     *,
     metrics: Fold | None = None,
     **simulation: Unpack[Simulation],
@@ -120,8 +122,8 @@ def measure(
 
 
 def prepared(
-    plant: Any, controller: Any, start: Any, metrics: Fold | None, *, batched: bool = False, **simulation: Any
-) -> tuple[Any, tuple[Plant, Any, Fold, Any], Settings, list[bool]]:
+    plant: Any, controller: Any, start: PlantState, metrics: Fold | None, *, batched: bool = False, **simulation: Any
+) -> tuple[PlantState, tuple[Plant, Any, Fold, Step], Settings, list[bool]]:
     """Checks the arguments of `simulate` and casts them to the initial state's dtype.
 
     Args:
@@ -169,12 +171,12 @@ def default_metrics(plant: Any) -> Fold:
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def _simulate(start: Tree, plant: Plant, controller: Any, fold: Fold, dt: jax.Array, *, settings: Settings) -> Any:
+def _simulate(start: PlantState, plant: Plant, controller: Any, fold: Fold, dt: Step, *, settings: Settings) -> Any:
     return results(*simulate(start, plant, controller, fold, dt, settings))
 
 
 def simulate(
-    start: Tree, plant: Any, controller: Any, fold: Any, dt: jax.Array, settings: Settings
+    start: PlantState, plant: Any, controller: Any, fold: Any, dt: Step, settings: Settings
 ) -> tuple[SavedSamples | None, Sample, Any]:
     """Simulates one initial state; arguments as `prepared` returns them.
 

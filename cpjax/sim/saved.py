@@ -9,31 +9,32 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Shaped
 
 from cpjax.sim import plants
 from cpjax.sim.metrics import Sample
-from cpjax.sim.plants import Plant
+from cpjax.sim.plants import Plant, PlantState, Tree
 
 
 class SavedSamples(NamedTuple):
     """Saved samples except the final one."""
 
-    packed: jax.Array
-    """Rows of `pack`, shape (rows, columns)."""
-    outputs: dict[str, jax.Array]
-    """Outputs of the plant by name, each of shape (rows,)."""
+    packed: Float[Array, " rows *batch columns"]
+    """Rows of `pack`."""
+    outputs: dict[str, Float[Array, " rows *batch"]]
+    """Outputs of the plant by name."""
 
 
-def pack(sample: Sample) -> jax.Array:
-    """Returns a sample as a row, shape (columns,)."""
+def pack(sample: Sample) -> Float[Array, " columns"]:
+    """Returns a sample as a row."""
     return jnp.stack([field.astype(sample.time.dtype) for field in jax.tree.leaves(_packed_fields(sample))])
 
 
-def keep(packed: jax.Array, plant: Plant, last: Sample) -> SavedSamples:
-    """Returns packed rows (rows, columns) with the plant's outputs added; `last` is a sample of the same run."""
+def keep(packed: Float[Array, "rows columns"], plant: Plant, last: Sample) -> SavedSamples:
+    """Returns packed rows with the plant's outputs added; `last` is a sample of the same run."""
     fields = _unpacked([packed[:, i] for i in range(packed.shape[1])], last)
 
-    def row(fields: _PackedFields) -> dict[str, Any]:
+    def row(fields: _PackedFields) -> dict[str, Float[Array, ""]]:
         q, v = plants.coordinates(plant, fields.state)
         acceleration = plants.accelerations(plant, plants.geometry(plant, q), v, fields.voltage, fields.plant_mode)
         return plants.outputs(plant, fields.state, acceleration, fields.voltage)
@@ -44,7 +45,7 @@ def keep(packed: jax.Array, plant: Plant, last: Sample) -> SavedSamples:
 def fields(kept: SavedSamples, last: Sample) -> dict[str, Any]:
     """Returns the fields of a `Trajectory`, shape (..., rows + 1), from all rows (row axis first) and `last`."""
 
-    def joined(many: jax.Array, one: jax.Array) -> jax.Array:
+    def joined(many: Shaped[Array, " rows *batch"], one: Shaped[Array, "*batch"]) -> Shaped[Array, "*batch samples"]:
         return jnp.concatenate([jnp.moveaxis(many, 0, -1).astype(one.dtype), one[..., None]], axis=-1)
 
     rows = _unpacked([kept.packed[..., i] for i in range(kept.packed.shape[-1])], last)
@@ -54,18 +55,18 @@ def fields(kept: SavedSamples, last: Sample) -> dict[str, Any]:
 
 
 class _PackedFields(NamedTuple):
-    time: jax.Array
-    state: Any
-    voltage: jax.Array
-    mode: jax.Array
-    plant_mode: Any
+    time: Float[Array, "*shape"]
+    state: PlantState
+    voltage: Float[Array, "*shape"]
+    mode: Int[Array, "*shape"]
+    plant_mode: Tree
 
 
 def _packed_fields(sample: Sample) -> _PackedFields:
     return _PackedFields(sample.time, sample.state, sample.voltage, sample.mode, sample.plant_mode)
 
 
-def _unpacked(columns: list[jax.Array], like: Sample) -> _PackedFields:
+def _unpacked(columns: list[Float[Array, "..."]], like: Sample) -> _PackedFields:
     ones, structure = jax.tree.flatten(_packed_fields(like))
     typed = [column.astype(one.dtype) for column, one in zip(columns, ones, strict=True)]
     unpacked: _PackedFields = jax.tree.unflatten(structure, typed)

@@ -7,14 +7,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Int
 
 from cpjax.sim.settings import Checkpoint
 
 
-def scan(body: Callable[[Any, Any], Any], carry: Any, xs: jax.Array, checkpoint: Checkpoint) -> Any:
+def scan(body: Callable[[Any, Any], Any], carry: Any, xs: Int[Array, " steps"], checkpoint: Checkpoint) -> Any:
     """Computes `lax.scan(body, carry, xs)`, whose reverse mode recomputes intermediate values from stored carries.
 
     Args:
+      body: function from the carry and one of `xs` to the new carry and what is stacked.
+      carry: the first carry, a pytree of arrays.
+      xs: numbers of the steps.
       checkpoint: which carries are stored. "segments": one in about sqrt(n), from which those in between are
         recomputed: memory grows with sqrt(n), and each step is computed three times. "every_step": all of them, so that
         each step is computed twice.

@@ -4,16 +4,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from cpjax.backend.single_kernel import outline
 from cpjax.controllers.protocol import ModalController, demand
 from cpjax.pytree import Scalar
 from cpjax.sim import plants
 from cpjax.sim.integrators import Integrator
-from cpjax.sim.plants import Plant, Tree
+from cpjax.sim.plants import Plant, PlantState, Tree
 
 
-def applied_voltage(plant: Plant, controller: ModalController, state: Tree, mode: jax.Array) -> jax.Array:
+def applied_voltage(
+    plant: Plant, controller: ModalController, state: PlantState, mode: Int[Array, ""]
+) -> Float[Array, ""]:
     """Returns the plant's input: the law's demand in `mode`, in the state's dtype, clipped by the drive."""
     return plants.saturate(plant, outline(demand)(controller, state, mode))
 
@@ -26,11 +29,11 @@ def dtype_of(tree: Tree) -> Any:
 def step_held(
     plant: Plant,
     integrator: Integrator,
-    state: Tree,
+    state: PlantState,
     u: Scalar,
     dt: Scalar,
     first: Tree | None = None,
-) -> Tree:
+) -> PlantState:
     """Returns the state after `dt` [s] under a constant input `u` (zero-order hold).
 
     Args:
@@ -47,12 +50,12 @@ def step_held(
 def step_held_incremental(
     plant: Plant,
     integrator: Integrator,
-    state: Tree,
+    state: PlantState,
     geometry: Tree,
     u: Scalar,
     dt: Scalar,
     first: Tree | None = None,
-) -> tuple[Tree, jax.Array]:
+) -> tuple[PlantState, Bool[Array, ""]]:
     """Computes `step_held` with the geometry at the later stages derived from that at `state`.
 
     Args:
@@ -79,11 +82,11 @@ def step_continuous(
     plant: Plant,
     controller: ModalController,
     integrator: Integrator,
-    state: Tree,
-    mode: jax.Array,
+    state: PlantState,
+    mode: Int[Array, ""],
     dt: Scalar,
     first: Tree | None = None,
-) -> Tree:
+) -> PlantState:
     """Returns the state after `dt` [s] with the law of `mode` evaluated, and its voltage clipped, in every stage.
 
     Args:

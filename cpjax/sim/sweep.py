@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Int, Shaped
 
 from cpjax.backend import runtime
 from cpjax.controllers.protocol import Controller, Law, ModalController
@@ -24,7 +25,7 @@ from cpjax.pytree import is_traced
 from cpjax.sim.flags import NEEDS_RECOMPUTE
 from cpjax.sim.initial import component_names
 from cpjax.sim.metrics import Fold, Sample
-from cpjax.sim.plants import Plant, Tree
+from cpjax.sim.plants import Plant, PlantState
 from cpjax.sim.rollout import prepared, results, simulate
 from cpjax.sim.saved import SavedSamples
 from cpjax.sim.settings import Settings, Simulation, check_names
@@ -56,7 +57,7 @@ _EVERYWHERE: Any = PartitionSpec()  # type: ignore[no-untyped-call]
 def sweep(
     plant: Plant,
     controller: Controller | ModalController | Law,
-    starts: Tree,
+    starts: PlantState,
     *,
     metrics: Fold | None = None,
     chunk: int | None = None,
@@ -161,7 +162,7 @@ class SweepPlan(NamedTuple):
         first = [column[0] for column in columns]
         return jax.tree.structure(jax.eval_shape(lambda: results(*_one(first, shared, self.kind))))
 
-    def _compute(self, members: np.ndarray, kind: _CompileKey) -> Any:
+    def _compute(self, members: Int[np.ndarray, " members"], kind: _CompileKey) -> Any:
         """Returns results and flags of these initial states, dispatched asynchronously."""
         columns, shared = _split(self.leaves, kind.batched)
         placed = [_place(np.asarray(column)[members], NamedSharding(kind.mesh, _SHARED_OUT)) for column in columns]
@@ -194,7 +195,7 @@ class SweepPlan(NamedTuple):
 def prepare(
     plant: Plant,
     controller: Controller | ModalController | Law,
-    starts: Tree,
+    starts: PlantState,
     *,
     metrics: Fold | None,
     chunk: int | None,
@@ -254,14 +255,19 @@ _Forms: TypeAlias = tuple[tuple[tuple[int, ...], str], ...]
 """Shape and dtype of each leaf that all initial states share."""
 
 
-def _block(columns: list[jax.Array], packed: dict[str, jax.Array], kind: _CompileKey, forms: _Forms) -> Any:
-    def share(columns: list[jax.Array], packed: dict[str, jax.Array]) -> Any:
+def _block(
+    columns: list[Shaped[Array, "starts ..."]],
+    packed: dict[str, Shaped[Array, " _"]],
+    kind: _CompileKey,
+    forms: _Forms,
+) -> Any:
+    def share(columns: list[Shaped[Array, "starts ..."]], packed: dict[str, Shaped[Array, " _"]]) -> Any:
         shared = _unpacked(packed, forms)
 
-        def chunk(column: list[jax.Array]) -> Any:
+        def chunk(column: list[Shaped[Array, "lanes ..."]]) -> Any:
             return jax.vmap(lambda lane: _one(lane, shared, kind), out_axes=(1, 0, 0))(column)
 
-        def packed_chunk(column: list[jax.Array]) -> Any:
+        def packed_chunk(column: list[Shaped[Array, "lanes ..."]]) -> Any:
             kept, *others = chunk(column)
             return kept, _stacked(others)
 
@@ -276,15 +282,15 @@ def _block(columns: list[jax.Array], packed: dict[str, jax.Array], kind: _Compil
     return jax.shard_map(share, mesh=kind.mesh, check_vma=False, **specs)(columns, packed)
 
 
-def _stacked(tree: Any) -> list[jax.Array]:
+def _stacked(tree: Any) -> list[Shaped[Array, "..."]]:
     """Stacks leaves of equal shape and dtype: for several arrays, XLA copies all that is written at every write."""
-    kinds: dict[Any, list[jax.Array]] = {}
+    kinds: dict[Any, list[Array]] = {}
     for leaf in jax.tree.leaves(tree):
         kinds.setdefault((leaf.shape, leaf.dtype), []).append(leaf)
     return [jnp.stack(leaves) for leaves in kinds.values()]
 
 
-def _unstacked(stacks: list[jax.Array], like: Any) -> Any:
+def _unstacked(stacks: list[Shaped[Array, "..."]], like: Any) -> Any:
     """Inverts `_stacked` for a tree of the shapes `like`, with one additional leading axis on all arrays."""
     leaves, structure = jax.tree.flatten(like)
     kinds = list(dict.fromkeys((leaf.shape, leaf.dtype) for leaf in leaves))
@@ -297,7 +303,7 @@ def _unstacked(stacks: list[jax.Array], like: Any) -> Any:
     return jax.tree.unflatten(structure, found)
 
 
-def _unpacked(packed: dict[str, jax.Array], forms: _Forms) -> list[jax.Array]:
+def _unpacked(packed: dict[str, Shaped[Array, " _"]], forms: _Forms) -> list[Shaped[Array, "..."]]:
     taken, leaves = dict.fromkeys(packed, 0), []
     for shape, dtype in forms:
         begin, taken[dtype] = taken[dtype], taken[dtype] + math.prod(shape)
@@ -310,7 +316,7 @@ def _compiled(platform: str) -> Any:
     return jax.jit(_block, static_argnames=("kind", "forms"), compiler_options=runtime.compiler_options(platform))
 
 
-def _unwritten(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+def _unwritten(shape: tuple[int, ...], dtype: Any) -> Shaped[np.ndarray, "..."]:
     """Returns an uninitialised NumPy array aligned to 64 bytes, which JAX can use without a copy."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     memory = np.empty(size + 64, np.uint8)
@@ -318,10 +324,10 @@ def _unwritten(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
     return memory[begin : begin + size].view(dtype).reshape(shape)
 
 
-def _place(array: np.ndarray, sharding: NamedSharding) -> jax.Array:
+def _place(array: Shaped[np.ndarray, "*shape"], sharding: NamedSharding) -> Shaped[Array, "*shape"]:
     return jax.make_array_from_callback(array.shape, sharding, lambda index: array[index])
 
 
-def _gather(array: jax.Array) -> np.ndarray:
+def _gather(array: Shaped[Array, "*shape"]) -> Shaped[np.ndarray, "*shape"]:
     whole = array if array.is_fully_addressable else multihost_utils.process_allgather(array, tiled=True)
     return np.asarray(whole)

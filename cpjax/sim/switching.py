@@ -22,19 +22,23 @@ flow one correction would suffice. The computed flow is that of the integrator, 
 from the vector field; each correction multiplies the difference by the integrator's relative error.
 """
 
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from cpjax.numeric.roots import crossing_fraction, newton_correction
 from cpjax.pytree import Scalar
-from cpjax.sim.integrators import Integrator
+from cpjax.sim.integrators import Integrator, Step
 
 Tree: TypeAlias = Any
+"""A pytree of arrays."""
+
 Guards: TypeAlias = tuple[Scalar, ...]
+"""Values of the guards, by number."""
 
 RUN, LANDED = 0, -1
 _CORRECTIONS = 2
@@ -54,6 +58,7 @@ class Observation(NamedTuple):
     """Further quantities for the caller."""
 
 
+@runtime_checkable
 class System(Protocol):
     """Second-order system q'' = a(q, v) with modes."""
 
@@ -61,7 +66,7 @@ class System(Protocol):
         """Returns the accelerations, guards and output, smooth in q and v."""
         ...
 
-    def jump(self, q: Tree, v: Tree, mode: Tree, guard: jax.Array) -> tuple[Tree, Tree, Tree]:
+    def jump(self, q: Tree, v: Tree, mode: Tree, guard: Int[Array, ""]) -> tuple[Tree, Tree, Tree]:
         """Returns q, v and mode after the guard of this number (int32) has fallen."""
         ...
 
@@ -76,31 +81,32 @@ class Motion(NamedTuple):
     """Observation at (q, v) in `mode`; just after a crossing, at the end of the previous mode."""
     slopes: Guards
     """d guards / dt, not differentiable."""
-    passed: jax.Array
+    passed: Int[Array, ""]
     """Number of grid points passed, int32."""
-    offset: jax.Array
+    offset: Step
     """Time since the last grid point [s]."""
-    step: jax.Array
+    step: Step
     """Step that the next iteration tries [s]."""
-    elapsed: jax.Array
+    elapsed: Step
     """Time between the last two points that were reached [s]."""
-    stage: jax.Array
-    guard: jax.Array
+    stage: Int[Array, ""]
+    """What the next iteration does: `RUN`, `LANDED`, or the number of the correction, int32."""
+    guard: Int[Array, ""]
     """Number of the guard whose crossing is being located, int32."""
-    reach: jax.Array
+    reach: Step
     """Length of a step after which that guard has fallen [s]."""
-    crossings: jax.Array
+    crossings: Int[Array, ""]
     """Number of crossings since the last grid point, int32."""
 
 
-def start_motion(system: System, q: Tree, v: Tree, mode: Tree, dt: jax.Array) -> Motion:
+def start_motion(system: System, q: Tree, v: Tree, mode: Tree, dt: Step) -> Motion:
     """Returns the motion at the first grid point, with steps of `dt` [s]."""
     seen, slopes, _ = observe(system, q, v, mode)
     none = jnp.zeros_like(dt, dtype=jnp.int32)
     return Motion(q, v, mode, seen, slopes, none, 0.0 * dt, dt, 0.0 * dt, none + RUN, none, dt, none)
 
 
-def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Array) -> tuple[Motion, jax.Array]:
+def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) -> tuple[Motion, Bool[Array, ""]]:
     """Performs one integrator step, accepted or rejected; also returns whether a new point of the motion was reached.
 
     Points are reached on the grid and at each crossing, there in the new mode.
@@ -181,13 +187,13 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: jax.Arra
     )
 
 
-def observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, Guards, list[jax.Array]]:
+def observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, Guards, list[Float[Array, "..."]]]:
     """Returns the system's observation, and the rates of change of its guards and of the floating-point leaves of its
     output, which are not differentiable."""
     seen = system.observe(q, v, mode)
     rates = lax.stop_gradient((v, seen.acceleration))
 
-    def changing(q: Tree, v: Tree) -> tuple[Guards, list[jax.Array]]:
+    def changing(q: Tree, v: Tree) -> tuple[Guards, list[Float[Array, "..."]]]:
         now = system.observe(q, v, mode)
         return now.guards, [leaf for leaf in jax.tree.leaves(now.output) if _is_float(leaf)]
 
@@ -199,13 +205,13 @@ def _is_float(leaf: Any) -> bool:
     return jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)
 
 
-def _shifted(output: Tree, drift: list[jax.Array], time: jax.Array) -> Tree:
+def _shifted(output: Tree, drift: list[Float[Array, "..."]], time: Float[Array, ""]) -> Tree:
     """Returns an output at a slightly later time, to first order."""
     left = iter(drift)
     return jax.tree.map(lambda leaf: leaf + time * next(left) if _is_float(leaf) else leaf, output)
 
 
-def pick(values: Guards, number: jax.Array) -> jax.Array:
+def pick(values: Guards, number: Int[Array, ""]) -> Float[Array, ""]:
     """Returns values[number] without a gather, as under `vmap` each value is an array of its own."""
     picked = jnp.asarray(values[0])
     for k, value in enumerate(values[1:], start=1):
@@ -213,5 +219,5 @@ def pick(values: Guards, number: jax.Array) -> jax.Array:
     return picked
 
 
-def _where(condition: jax.Array, new: Tree, old: Tree) -> Tree:
+def _where(condition: Bool[Array, ""], new: Tree, old: Tree) -> Tree:
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
