@@ -7,25 +7,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jaxtyping import Float
 
 from cpjax import workspace
 from cpjax.archive import read_archive, write_archive
 from cpjax.errors import InputError
-
-Numbers = np.ndarray[Any, Any]
+from cpjax.tune.descent import OptimiserState
 
 
 class TunerState(NamedTuple):
-    """State from which a tuning of r restarts with d free parameters resumes: the content of its checkpoint file."""
+    """State from which a tuning resumes: the content of its checkpoint file."""
 
     step: int
-    vectors: Numbers
-    """Current free parameters (r, d)."""
-    optimiser: Any
-    best: Numbers
-    """Free parameters with the best validation score of each restart (r, d)."""
-    scores: Numbers
-    """Scores of `best` (r,)."""
+    vectors: Float[np.ndarray, "restarts parameters"]
+    """Current free parameters."""
+    optimiser: OptimiserState
+    best: Float[np.ndarray, "restarts parameters"]
+    """Free parameters with the best validation score of each restart."""
+    scores: Float[np.ndarray, " restarts"]
+    """Scores of `best`."""
     stale: int
     """Validations since the last improvement."""
     history: list[dict[str, Any]]

@@ -1,22 +1,32 @@
 """Parts shared by all tunings of many controllers at once: optimiser steps, evaluation in blocks, derived seeds."""
 
 import operator
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jaxtyping import Array, Bool, Float
+
+OptimiserState: TypeAlias = Any
+"""State of an optax optimiser: a pytree of arrays."""
 
 
-def step(optimiser: optax.GradientTransformation, vectors: jax.Array, state: Any, slope: jax.Array) -> Any:
+def step(
+    optimiser: optax.GradientTransformation,
+    vectors: Float[Array, "vectors parameters"],
+    state: OptimiserState,
+    slope: Float[Array, "vectors parameters"],
+) -> tuple[Float[Array, "vectors parameters"], OptimiserState]:
     """Returns the vectors and the optimiser's state after a step; elements that would not be finite do not move.
 
     Args:
       optimiser: an optax transformation.
-      vectors: free parameters (n, d).
+      vectors: free parameters.
       state: the optimiser's state.
-      slope: gradients (n, d).
+      slope: gradients.
     """
     with jax.numpy_dtype_promotion("standard"):  # optax's own arithmetic mixes dtypes
         change, state = optimiser.update(slope, state)
@@ -24,12 +34,14 @@ def step(optimiser: optax.GradientTransformation, vectors: jax.Array, state: Any
     return jnp.where(jnp.isfinite(moved), moved, vectors), state
 
 
-def clip_factors(slopes: jax.Array, sound: jax.Array, clip: float) -> jax.Array:
-    """Returns factors (n,) that scale each gradient down to at most `clip` times the median norm of the sound ones.
+def clip_factors(
+    slopes: Float[Array, "starts parameters"], sound: Bool[Array, " starts"], clip: float
+) -> Float[Array, " starts"]:
+    """Returns factors that scale each gradient down to at most `clip` times the median norm of the sound ones.
 
     Args:
-      slopes: gradients (n, d), finite.
-      sound: which gradients count for the median (n,), bool.
+      slopes: gradients, finite.
+      sound: which gradients count for the median.
       clip: largest norm, relative to the median [1].
     """
     norms = jnp.sqrt(jnp.sum(slopes * slopes, axis=1))
@@ -38,7 +50,7 @@ def clip_factors(slopes: jax.Array, sound: jax.Array, clip: float) -> jax.Array:
     return jnp.minimum(1.0, clip * median / jnp.maximum(norms, tiny))
 
 
-def in_blocks(function: Any, block: int, *trees: Any) -> Any:
+def in_blocks(function: Callable[..., Any], block: int, *trees: Any) -> Any:
     """Applies a batched function block by block, so that it is compiled for one batch size only.
 
     Args:

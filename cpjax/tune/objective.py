@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from cpjax.backend.extremes import fast_maximum
 from cpjax.errors import InputError
@@ -17,24 +18,24 @@ from cpjax.fields import renamed
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, number, part, pytree
-from cpjax.sim.metrics import Fold, Sample, TimeOutside
+from cpjax.sim.metrics import Fold, Integral, MetricState, Sample, TimeOutside
 
 
 class _Integral:
     """Metric that integrates `rate(state, voltage)` over time, by the trapezoidal rule."""
 
-    def rate(self, state: State, voltage: jax.Array) -> jax.Array:
+    def rate(self, state: State, voltage: Float[Array, ""]) -> Float[Array, ""]:
         raise NotImplementedError
 
-    def init(self, sample: Sample) -> tuple[jax.Array, jax.Array]:
+    def init(self, sample: Sample) -> Integral:
         return jnp.zeros_like(sample.time), self.rate(sample.state, sample.voltage)
 
-    def update(self, memory: tuple[jax.Array, jax.Array], sample: Sample) -> tuple[jax.Array, jax.Array]:
+    def update(self, memory: Integral, sample: Sample) -> Integral:
         total, before = memory
         until = self.rate(sample.state, sample.voltage_before)
         return total + 0.5 * sample.elapsed * (before + until), self.rate(sample.state, sample.voltage)
 
-    def finish(self, memory: tuple[jax.Array, jax.Array], last: Sample) -> jax.Array:
+    def finish(self, memory: Integral, last: Sample) -> Float[Array, ""]:
         return memory[0]
 
 
@@ -42,7 +43,7 @@ class _Integral:
 class Effort(_Integral):
     """Metric: the integral of u^2 dt [V^2 s]."""
 
-    def rate(self, state: State, voltage: jax.Array) -> jax.Array:
+    def rate(self, state: State, voltage: Float[Array, ""]) -> Float[Array, ""]:
         return voltage * voltage
 
 
@@ -56,7 +57,7 @@ class TrackExcess(_Integral):
     limit: Scalar = number("m", "the track: |x| within", above=0.0)
     margin: Scalar = number("m", "where the cost begins before the limit, and over which it rises", above=0.0)
 
-    def rate(self, state: State, voltage: jax.Array) -> jax.Array:
+    def rate(self, state: State, voltage: Float[Array, ""]) -> Float[Array, ""]:
         over = jnp.maximum(jnp.abs(state.x) - self.limit + self.margin, 0.0) / self.margin
         return 1.0 - jnp.exp(-0.5 * over * over)
 
@@ -72,7 +73,7 @@ class EnergyError(_Integral):
     plant: CartPole = part("plant whose pendulum energy counts, a CartPole", "pendulum_energy")
     width: Scalar = number("1", "of the target", default=0.5, above=0.0)
 
-    def rate(self, state: State, voltage: jax.Array) -> jax.Array:
+    def rate(self, state: State, voltage: Float[Array, ""]) -> Float[Array, ""]:
         lift = 2.0 * self.plant.pole_mass * self.plant.gravity * self.plant.pole_length
         error = self.plant.pendulum_energy(state) / (lift * self.width)
         return 1.0 - jnp.exp(-0.5 * error * error)
@@ -84,19 +85,19 @@ class VoltageVariation:
 
     rounding: Scalar = number("V", "changes far smaller than this count little", default=0.1, above=0.0)
 
-    def init(self, sample: Sample) -> jax.Array:
+    def init(self, sample: Sample) -> Float[Array, ""]:
         return jnp.zeros_like(sample.time)
 
-    def update(self, memory: jax.Array, sample: Sample) -> jax.Array:
+    def update(self, memory: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
         moved = self._size(sample.voltage - sample.voltage_before)
         if sample.voltage_until is not None:
             moved = moved + self._size(sample.voltage_until - sample.voltage_since)
         return memory + moved
 
-    def finish(self, memory: jax.Array, last: Sample) -> jax.Array:
+    def finish(self, memory: Float[Array, ""], last: Sample) -> Float[Array, ""]:
         return memory
 
-    def _size(self, change: jax.Array) -> jax.Array:
+    def _size(self, change: Float[Array, ""]) -> Float[Array, ""]:
         return jnp.sqrt(change * change + self.rounding * self.rounding) - self.rounding
 
 
@@ -107,16 +108,16 @@ class TerminalCost:
     angle_width: Scalar = number("rad", "of the target", default=0.2, above=0.0)
     position_width: Scalar = number("m", "of the target", default=0.2, above=0.0)
 
-    def init(self, sample: Sample) -> jax.Array:
+    def init(self, sample: Sample) -> Float[Array, ""]:
         return self._outside(sample)
 
-    def update(self, memory: jax.Array, sample: Sample) -> jax.Array:
+    def update(self, memory: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
         return self._outside(sample)
 
-    def finish(self, memory: jax.Array, last: Sample) -> jax.Array:
+    def finish(self, memory: Float[Array, ""], last: Sample) -> Float[Array, ""]:
         return memory
 
-    def _outside(self, sample: Sample) -> jax.Array:
+    def _outside(self, sample: Sample) -> Float[Array, ""]:
         return TimeOutside(self.angle_width, self.position_width)._outside(sample)
 
 
@@ -126,13 +127,13 @@ class RemainingTime:
 
     duration: Scalar = number("s", "of the whole run", above=0.0)
 
-    def init(self, sample: Sample) -> jax.Array:
+    def init(self, sample: Sample) -> Float[Array, ""]:
         return jnp.zeros_like(sample.time)
 
-    def update(self, memory: jax.Array, sample: Sample) -> jax.Array:
+    def update(self, memory: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
         return memory + sample.elapsed
 
-    def finish(self, memory: jax.Array, last: Sample) -> jax.Array:
+    def finish(self, memory: Float[Array, ""], last: Sample) -> Float[Array, ""]:
         return jnp.asarray(self.duration, memory.dtype) - memory
 
 
@@ -140,28 +141,28 @@ class RemainingTime:
 class Travel:
     """Cart travel max |x| [m]."""
 
-    def init(self, sample: Sample) -> jax.Array:
+    def init(self, sample: Sample) -> Float[Array, ""]:
         return jnp.zeros_like(sample.time)
 
-    def update(self, memory: jax.Array, sample: Sample) -> jax.Array:
+    def update(self, memory: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
         return fast_maximum(memory, jnp.abs(sample.state.x))
 
-    def finish(self, memory: jax.Array, last: Sample) -> jax.Array:
+    def finish(self, memory: Float[Array, ""], last: Sample) -> Float[Array, ""]:
         return memory
 
 
 class _Several:
     """Several metrics computed together."""
 
-    terms: tuple[Any, ...]
+    terms: tuple[Fold, ...]
 
-    def init(self, sample: Sample) -> tuple[Any, ...]:
+    def init(self, sample: Sample) -> tuple[MetricState, ...]:
         return tuple(term.init(sample) for term in self.terms)
 
-    def update(self, memory: tuple[Any, ...], sample: Sample) -> tuple[Any, ...]:
+    def update(self, memory: tuple[MetricState, ...], sample: Sample) -> tuple[MetricState, ...]:
         return tuple(term.update(m, sample) for term, m in zip(self.terms, memory, strict=True))
 
-    def _results(self, memory: tuple[Any, ...], last: Sample) -> list[Any]:
+    def _results(self, memory: tuple[MetricState, ...], last: Sample) -> list[Any]:
         return [term.finish(m, last) for term, m in zip(self.terms, memory, strict=True)]
 
 
@@ -169,10 +170,10 @@ class _Several:
 class WeightedSum(_Several):
     """Weighted sum of the results of several metrics."""
 
-    terms: tuple[Any, ...]
+    terms: tuple[Fold, ...]
     weights: tuple[Scalar, ...]
 
-    def finish(self, memory: tuple[Any, ...], last: Sample) -> jax.Array:
+    def finish(self, memory: tuple[MetricState, ...], last: Sample) -> Float[Array, ""]:
         total = jnp.zeros_like(last.time)
         for weight, result in zip(self.weights, self._results(memory, last), strict=True):
             total = total + jnp.asarray(weight, dtype=total.dtype) * result
@@ -187,14 +188,16 @@ class Lagrangian(_Several):
     when the run is stopped early.
     """
 
-    terms: tuple[Any, ...]
+    terms: tuple[Fold, ...]
     """Metrics: the time outside the target, the costs, and the remaining time of a stopped run."""
-    multipliers: tuple[Any, ...]
+    multipliers: tuple[Scalar, ...]
     """Multiplier of each cost [s per unit of the cost]."""
-    stop_penalty: Any
+    stop_penalty: Scalar
     """Extra weight of each second lost when a run stops early [1]."""
 
-    def finish(self, memory: tuple[Any, ...], last: Sample) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    def finish(
+        self, memory: tuple[MetricState, ...], last: Sample
+    ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], ...]]:
         time, *costs, undone = self._results(memory, last)
         total = time + undone * (1.0 + self.stop_penalty)
         for multiplier, cost in zip(self.multipliers, costs, strict=True):
@@ -252,8 +255,8 @@ WEIGHTS = ("time", "effort", "track", "voltage_variation", "energy", "terminal")
 """Names of the weights of a `Goal`."""
 
 
-Aggregate: TypeAlias = Callable[[jax.Array], jax.Array]
-"""Reduces the values of n initial states (n,) to one number (); its derivative is the weight of each gradient."""
+Aggregate: TypeAlias = Callable[[Float[Array, " starts"]], Float[Array, ""]]
+"""Reduces the values of all initial states to one number; its derivative is the weight of each gradient."""
 
 
 def tail_mean(share: float) -> Aggregate:
@@ -267,7 +270,7 @@ def tail_mean(share: float) -> Aggregate:
     """
     _check_share("share", share)
 
-    def worst(values: jax.Array) -> jax.Array:
+    def worst(values: Float[Array, " starts"]) -> Float[Array, ""]:
         count = max(1, round(share * values.shape[0]))
         return jnp.mean(jax.lax.top_k(values, count)[0])
 
@@ -286,7 +289,7 @@ def soft_maximum(temperature: float) -> Aggregate:
     if isinstance(temperature, (bool, str)) or not 0.0 < temperature < math.inf:
         raise InputError("temperature", temperature, "a finite number above 0")
 
-    def smooth(values: jax.Array) -> jax.Array:
+    def smooth(values: Float[Array, " starts"]) -> Float[Array, ""]:
         log_count = jnp.log(jnp.asarray(values.shape[0], dtype=values.dtype))
         return temperature * (jax.nn.logsumexp(values / temperature) - log_count)
 
@@ -308,7 +311,7 @@ def success_weighted(threshold: float, temperature: float) -> Aggregate:
     if isinstance(temperature, (bool, str)) or not 0.0 < temperature < math.inf:
         raise InputError("temperature", temperature, "a finite number above 0")
 
-    def weighed(values: jax.Array) -> jax.Array:
+    def weighed(values: Float[Array, " starts"]) -> Float[Array, ""]:
         weights = jax.nn.sigmoid((threshold - values) / temperature)
         return jnp.sum(weights * values) / jnp.sum(weights)
 

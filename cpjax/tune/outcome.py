@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from cpjax import files, io
 from cpjax.controllers import Hybrid
@@ -12,8 +13,6 @@ from cpjax.plant import CartPole
 from cpjax.tune.config import TuningConfig
 from cpjax.tune.parameters import FreeParameters
 
-Numbers = np.ndarray[Any, Any]
-
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
@@ -21,9 +20,9 @@ class Tuning:
 
     Attributes:
       controller: the best controller.
-      vector: its free parameters, unconstrained (d,).
-      labels: names of the free parameters (d,).
-      physical: values of the free parameters in SI units (d,).
+      vector: its free parameters, unconstrained.
+      labels: names of the free parameters.
+      physical: values of the free parameters in SI units.
       score: mean over the last comparison's initial states of the settling time, with 30 horizons for a failure, of the
         effort and of the voltage variation, weighted as in the goal [s].
       success_rate: on the initial states of the last comparison.
@@ -35,9 +34,9 @@ class Tuning:
     """
 
     controller: Hybrid
-    vector: Numbers
+    vector: Float[np.ndarray, " parameters"]
     labels: tuple[str, ...]
-    physical: Numbers
+    physical: Float[np.ndarray, " parameters"]
     score: float
     success_rate: float
     settling_time: float

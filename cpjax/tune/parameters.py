@@ -13,14 +13,15 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from cpjax.controllers import EnergySwingUp, Hybrid, LqrWeights, LyapunovGate, PoleFactors, StateFeedback
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, linearize
 from cpjax.pytree import Number, rules
 
-Vector: TypeAlias = jax.Array
-"""Unconstrained parameters (d,)."""
+Vector: TypeAlias = Float[Array, " parameters"]
+"""Free parameters, unconstrained."""
 
 FROZEN = ("R", "hysteresis", "kick", "kick_radius")
 """Names that are not free by default: K depends on Q / R alone, and the others are small corrections."""
@@ -46,7 +47,7 @@ class _Slot(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class FreeParameters:
-    """Free parameters of `controller`, and the maps between an unconstrained vector (d,) and a controller.
+    """Free parameters of `controller`, and the maps between an unconstrained vector and a controller.
 
     Built by `free_parameters`.
     """
@@ -61,13 +62,13 @@ class FreeParameters:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Name of each element of a physical vector (d,), such as "Q[0]"."""
+        """Name of each element of a physical vector, such as "Q[0]"."""
         return tuple(
             slot.name if slot.size == 1 else f"{slot.name}[{i}]" for slot in self.slots for i in range(slot.size)
         )
 
     def start(self) -> Vector:
-        """Returns the vector (d,) of `controller` itself; zeros become small numbers where a logarithm is taken."""
+        """Returns the vector of `controller` itself; zeros become small numbers where a logarithm is taken."""
         parts = []
         for slot in self.slots:
             value = np.asarray(_read(self.controller, slot), dtype=np.float64).reshape(-1)
@@ -83,13 +84,13 @@ class FreeParameters:
             parts.append(value)
         return jnp.asarray(np.concatenate(parts), dtype=jnp.result_type(float))
 
-    def physical(self, vector: Vector) -> Vector:
-        """Returns the parameters (d,) of a vector (d,) in SI units; for a full Q the rows of its lower triangle."""
+    def physical(self, vector: Vector) -> Float[Array, " parameters"]:
+        """Returns the parameters of a vector in SI units; for a full Q the rows of its lower triangle."""
         values = (self._value(slot, vector) for slot in self.slots)
         return jnp.concatenate([v if v.ndim == 1 else v[jnp.tril_indices(4)] for v in values])
 
     def build(self, vector: Vector) -> Hybrid:
-        """Returns the controller of a vector (d,). Differentiable, also under jit and vmap."""
+        """Returns the controller of a vector. Differentiable, also under jit and vmap."""
         given: dict[str, dict[str, Any]] = {"swing_up": {}, "design": {}, "gate": {}}
         for slot in self.slots:
             value = self._value(slot, vector)
@@ -108,8 +109,10 @@ class FreeParameters:
                 gate = dataclasses.replace(gate, P=found.P)
         return Hybrid(swing_up, regulator, gate)
 
-    def draw(self, random: np.random.Generator, count: int, *, short_track: bool = False) -> np.ndarray[Any, Any]:
-        """Draws random vectors (count, d) from the slots' ranges, uniform in the logarithm, or in the angle itself.
+    def draw(
+        self, random: np.random.Generator, count: int, *, short_track: bool = False
+    ) -> Float[np.ndarray, "vectors parameters"]:
+        """Draws random vectors from the slots' ranges, uniform in the logarithm, or in the angle itself.
 
         Args:
           random: generator of the random numbers.
@@ -137,7 +140,7 @@ class FreeParameters:
                     columns.append(random.uniform(low, high, count))
         return np.stack(columns, axis=1)
 
-    def _value(self, slot: _Slot, vector: Vector) -> jax.Array:
+    def _value(self, slot: _Slot, vector: Vector) -> Float[Array, " slot"] | Float[Array, "4 4"]:
         x = vector[slot.begin : slot.begin + slot.size]
         if slot.kind == "log":
             return jnp.exp(x)
@@ -271,8 +274,8 @@ def _weights(controller: Hybrid) -> LqrWeights:
     return regulator.design
 
 
-def _scales(controller: Hybrid) -> np.ndarray[Any, Any]:
-    """Returns the natural units of the elements of Q's diagonal (4,)."""
+def _scales(controller: Hybrid) -> Float[np.ndarray, "4"]:
+    """Returns the natural units of the elements of Q's diagonal."""
     return np.asarray(_natural(controller).weights) * float(_weights(controller).R)
 
 
@@ -292,15 +295,15 @@ def _read(controller: Hybrid, slot: _Slot) -> Any:
 _BELOW = np.tril_indices(4, -1)
 
 
-def _full(x: jax.Array) -> jax.Array:
-    """Returns Q = D U U' D (4, 4) of x (10,): D diagonal, exp(x[:4]); U unit lower triangular, x[4:] below ones."""
+def _full(x: Float[Array, "10"]) -> Float[Array, "4 4"]:
+    """Returns Q = D U U' D: D diagonal, exp(x[:4]); U unit lower triangular, x[4:] below ones."""
     U = jnp.eye(4, dtype=x.dtype).at[_BELOW].set(x[4:])
     L = jnp.exp(x[:4])[:, None] * U
     return L @ L.T
 
 
-def _from_full(Q: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Returns the x (10,) from which `_full` builds Q; a nearly singular Q gets a small multiple of I added."""
+def _from_full(Q: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "10"]:
+    """Returns the x from which `_full` builds Q; a nearly singular Q gets a small multiple of I added."""
     floor = _LEAST**2 * np.max(np.diagonal(Q))
     L = np.linalg.cholesky(Q + floor * np.eye(4)) if np.min(np.linalg.eigvalsh(Q)) < floor else np.linalg.cholesky(Q)
     D = np.diagonal(L)

@@ -1,8 +1,7 @@
 """Random plants around a nominal plant: to check robustness, and to tune over uncertain parameters."""
 
-from typing import Any
-
 import numpy as np
+from jaxtyping import Float
 
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor, parameter, parameters_of, with_parameters
@@ -56,7 +55,7 @@ def sample_plants(plant: CartPole, count: int, *, spread: float, seed: int, only
         raise InputError("only", only, "one of " + ", ".join(uncertain))
     together = np.random.default_rng(seed).uniform(-1.0, 1.0, size=(count, len(_DRAWN_TOGETHER)))
 
-    def drawn(name: str, rule: Number) -> Any:
+    def drawn(name: str, rule: Number) -> Float[np.ndarray, " plants"]:
         value = float(parameter(plant, name))
         if not rule.uncertain or only not in (None, name):
             return np.full(count, value)

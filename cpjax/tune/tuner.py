@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jaxtyping import Array, Float, Shaped
 
 from cpjax import files
 from cpjax.controllers import Hybrid, StateFeedback
@@ -32,7 +33,6 @@ from cpjax.tune.outcome import Tuning, request
 from cpjax.tune.parameters import FreeParameters, Vector
 from cpjax.tune.plants import sample_plants
 
-Numbers = np.ndarray[Any, Any]
 Report = Callable[[int, int, str], None]
 
 _FAILURE = 30.0  # settling time that a failed run counts as, in horizons: success comes before time
@@ -157,7 +157,7 @@ class _Tuner:
         vectors[losers] = memory.best[winners] + noise.astype(vectors.dtype)
         best[losers], scores[losers] = vectors[losers], np.inf
 
-        def inherited(leaf: jax.Array) -> jax.Array:
+        def inherited(leaf: Shaped[Array, "*leaf"]) -> Shaped[Array, "*leaf"]:
             return leaf.at[losers].set(leaf[winners]) if leaf.ndim == 2 else leaf
 
         return memory._replace(
@@ -226,14 +226,16 @@ class _Tuner:
             plants = jax.tree.map(lambda column: jnp.asarray(column, dtype), drawn)
         return jax.tree.map(jnp.asarray, starts), plants
 
-    def _gradient(self, vector: Vector, starts: State, plants: CartPole | None, width: jax.Array) -> Any:
-        """Returns loss and gradient (d,) of one restart; each state's gradient is norm-clipped before averaging."""
+    def _gradient(
+        self, vector: Vector, starts: State, plants: CartPole | None, width: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, " parameters"]]:
+        """Returns loss and gradient of one restart; each state's gradient is norm-clipped before averaging."""
         plan = self.plan
 
-        def objective(vector: Vector, start: State, plant: CartPole | None) -> jax.Array:
+        def objective(vector: Vector, start: State, plant: CartPole | None) -> Float[Array, ""]:
             plant = self.plant if plant is None else plant
             fold = plan.goal.fold(self.free.model, width, plan.duration)
-            value: jax.Array = measure(plant, self.free.build(vector), start, **self.located, metrics=fold)
+            value: Float[Array, ""] = measure(plant, self.free.build(vector), start, **self.located, metrics=fold)
             return value
 
         values, slopes = jax.vmap(functools.partial(jax.value_and_grad(objective), vector))(starts, plants)
@@ -246,20 +248,22 @@ class _Tuner:
         slope = jnp.sum((shares * clip_factors)[:, None] * slopes, axis=0) + jax.grad(self._fast_pole_penalty)(vector)
         return loss, jnp.where(jnp.isfinite(slope), slope, 0.0)  # a NaN would stay in Adam's moments
 
-    def _fast_pole_penalty(self, vector: Vector) -> jax.Array:
+    def _fast_pole_penalty(self, vector: Vector) -> Float[Array, ""]:
         """Returns a penalty on closed-loop poles faster than 90 % of `pole_limit`."""
         excess = jnp.log(fastest_pole_bound(self._closed_loop(vector)) / (0.9 * self.plan.pole_limit))
         return 10.0 * jnp.maximum(excess, 0.0) ** 2
 
-    def _closed_loop(self, vector: Vector) -> jax.Array:
-        """Returns A - B K (4, 4) of the model used by the law."""
+    def _closed_loop(self, vector: Vector) -> Float[Array, "4 4"]:
+        """Returns A - B K of the model used by the law."""
         A, B = linearize(self.free.model)
         regulator = self.free.build(vector).regulator
         assert isinstance(regulator, StateFeedback)
         return A - B @ jnp.asarray(regulator.K)
 
-    def _score(self, vectors: Numbers, count: int, purpose: int) -> tuple[Numbers, Numbers, Numbers]:
-        """Returns score, success rate and mean settling time (n,) of vectors (n, d), from `count` initial states."""
+    def _score(
+        self, vectors: Float[np.ndarray, "vectors parameters"], count: int, purpose: int
+    ) -> tuple[Float[np.ndarray, " vectors"], Float[np.ndarray, " vectors"], Float[np.ndarray, " vectors"]]:
+        """Returns score, success rate and mean settling time of each vector, from `count` initial states."""
         plan, goal = self.plan, self.plan.goal
         starts, plants = self._draw(count, purpose)
         final = purpose == _FINAL
@@ -291,7 +295,7 @@ class _Tuner:
         settled = np.where(successes > 0, settled / np.maximum(successes, 1), np.nan)
         return score, successes / count, settled
 
-    def _controller(self, vector: Vector) -> tuple[Hybrid, jax.Array]:
+    def _controller(self, vector: Vector) -> tuple[Hybrid, Float[Array, ""]]:
         """Returns the controller, and the magnitude of its fastest closed-loop pole [1/s]."""
         poles = jnp.linalg.eigvals(self._closed_loop(vector))
         return self.free.build(vector), jnp.max(jnp.abs(poles))
@@ -307,8 +311,8 @@ def _watched(count: int) -> int:
     return count // 8
 
 
-def fastest_pole_bound(A: jax.Array) -> jax.Array:
-    """Returns a bound on the spectral radius of A (4, 4): |A^64|^(1/64) in the Frobenius norm (Gelfand, 1941).
+def fastest_pole_bound(A: Float[Array, "n n"]) -> Float[Array, ""]:
+    """Returns a bound on the spectral radius of A: |A^64|^(1/64) in the Frobenius norm (Gelfand, 1941).
 
     Unlike the eigenvalues it is differentiable where some of them coincide. It exceeds the spectral radius by the 64th
     root of the condition number of A's eigenvectors, by about a tenth.
