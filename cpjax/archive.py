@@ -11,7 +11,7 @@ import numpy as np
 from cpjax.errors import InputError
 from cpjax.files import dump_json, parse_json, write_bytes
 
-Arrays = dict[str, np.ndarray[Any, Any]]
+Arrays = dict[str, np.ndarray]
 
 _NOTE = "cpjax"  # key of the note in the file
 _DIGEST = "digest"  # key of the checksum in the note

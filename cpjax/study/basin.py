@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from jaxtyping import ArrayLike, Bool, Float
 
 from cpjax.errors import InputError
 from cpjax.numeric.statistics import wilson_interval
@@ -52,8 +53,8 @@ class Axis:
         """Unit of the coordinate."""
         return UNITS[NAMES.index(self.name)]
 
-    def edges(self) -> np.ndarray[Any, Any]:
-        """Returns the edges of the cells (cells + 1,), in `unit`."""
+    def edges(self) -> Float[np.ndarray, " edges"]:
+        """Returns the edges of the cells, one more than cells, in `unit`."""
         return np.linspace(self.low, self.high, self.cells + 1)
 
 
@@ -118,7 +119,7 @@ class StartGrid:
         return State(**{name: column.ravel() for name, column in found.items()})
 
     @staticmethod
-    def _within(axis: Axis, cell: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def _within(axis: Axis, cell: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
         return axis.low + (axis.high - axis.low) / axis.cells * cell
 
 
@@ -137,7 +138,7 @@ class Area:
     share: float
 
 
-def area(chart: StartGrid, success: np.ndarray[Any, Any]) -> Area:
+def area(chart: StartGrid, success: Bool[ArrayLike, " starts"]) -> Area:
     """Estimates the basin's area and its uncertainty.
 
     One random initial state in each cell is a stratified sample. Its mean is unbiased, and its variance is that within
@@ -147,7 +148,7 @@ def area(chart: StartGrid, success: np.ndarray[Any, Any]) -> Area:
 
     Args:
       chart: the grid.
-      success: whether the run from each of the grid's initial states succeeded (rows * columns,), bool.
+      success: whether the run from each of the grid's initial states succeeded, the lowest row first.
     """
     caught = np.asarray(success, float).reshape(chart.shape)
     differences = [np.mean(np.diff(caught, axis=axis) ** 2) for axis in (0, 1)]

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Complex, Float
 
 from cpjax import files
 from cpjax.controllers import AngleGate, AngleRateGate, LyapunovGate, StateFeedback
@@ -31,29 +32,29 @@ class DesignCheck:
     """Result of `check_design`. `P`, `level`, `limited_by` and `extent` are None if the linear loop is not stable.
 
     Attributes:
-      K: the gain (1, 4).
-      poles: of the linear closed loop (4,) [1/s].
+      K: the gain.
+      poles: of the linear closed loop [1/s].
       margins: of the loop broken at the voltage.
       controllability: of the linear model from the voltage.
       observability: of the linear model from x and theta.
       gate_angle: angle at which the gate opens, at rest with the cart at its reference [rad].
       gate_voltage: magnitude of the voltage demanded there [V].
       saturation_angle: angle beyond which, in the same state, the demand exceeds the voltage limit [rad].
-      P: matrix of the linear closed loop's Lyapunov function s' P s, whose derivative is -s' s (4, 4).
+      P: matrix of the linear closed loop's Lyapunov function s' P s, whose derivative is -s' s.
       level: the largest s' P s whose level set lies inside the voltage limit and the gate.
       limited_by: which of the two bounds the level, "voltage" or "gate".
       extent: largest value of each coordinate in that level set, in the order of the state [SI].
     """
 
-    K: np.ndarray[Any, Any]
-    poles: np.ndarray[Any, Any]
+    K: Float[np.ndarray, "1 4"]
+    poles: Complex[np.ndarray, "4"]
     margins: Margins
     controllability: Structure
     observability: Structure
     gate_angle: float
     gate_voltage: float
     saturation_angle: float
-    P: np.ndarray[Any, Any] | None
+    P: Float[np.ndarray, "4 4"] | None
     level: float | None
     limited_by: str | None
     extent: tuple[float, ...] | None
@@ -136,7 +137,7 @@ def _opening_angle(gate: Gate) -> float:
     return float(gate.half_angle)
 
 
-def _level_within(gate: Gate, P: Any) -> Any:
+def _level_within(gate: Gate, P: Float[Array, "4 4"]) -> Float[Array, ""]:
     if isinstance(gate, LyapunovGate):
         return level_within_form(P, jnp.asarray(gate.P, dtype=P.dtype), gate.level)
     if isinstance(gate, AngleRateGate):

@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Real
 
 from cpjax import files
 from cpjax.controllers import Hybrid, SmoothClip, SmoothHybrid
@@ -22,14 +23,14 @@ from cpjax.errors import InputError
 from cpjax.numeric.differences import Differences, central_differences
 from cpjax.plant import CartPole
 from cpjax.plant.state import NAMES, State
-from cpjax.pytree import is_traced
+from cpjax.pytree import Scalar, is_traced
 from cpjax.sim.flags import STOPPED, describe
 from cpjax.sim.initial import checked_initial
 from cpjax.sim.metrics import Fold, TimeOutside
 from cpjax.sim.rollout import measure
-from cpjax.sim.settings import check_settings
+from cpjax.sim.settings import Switching, check_settings
 from cpjax.study.gradient_probe import HorizonRecorder, Probe
-from cpjax.study.named_parameters import Build, Numbers, as_matrix, as_tree, parameter_scales
+from cpjax.study.named_parameters import Build, as_matrix, as_tree, parameter_scales
 
 Report: TypeAlias = Callable[[int, int, str], None]
 
@@ -47,83 +48,91 @@ RESOLUTION = 3e-7
 
 _STEPS = 1e-3 * 4.0 ** -np.arange(7)
 
+Derivatives: TypeAlias = Float[np.ndarray, "starts horizons parameters"]
+"""Derivatives of the objective with respect to relative changes of the parameters."""
+
+Verdicts: TypeAlias = Bool[np.ndarray, "starts horizons parameters"]
+"""Whether something is so, of each of the `Derivatives`."""
+
 
 @dataclasses.dataclass(frozen=True)
 class GradientAudit:
-    """Result of `audit_gradients`, for n initial states, k horizons and d parameters.
+    """Result of `audit_gradients`.
 
     Derivatives are with respect to relative changes: |p| times the derivative in a parameter p, or its scale times the
-    derivative if a scale was given. Shape (n, k, d).
+    derivative if a scale was given.
 
     Attributes:
-      names: of the parameters, d; "Q[0]" for an element.
-      horizons: (k,) [s].
+      names: of the parameters; "Q[0]" for an element.
+      horizons: times at which the objective is read [s].
       temperatures: of the smooth surrogates.
-      value: the objective (n, k).
+      value: the objective.
       located: derivatives by automatic differentiation, with located switching.
       plain: the same, with switching per step.
       smooth: the same, one array for each temperature.
       difference: finite differences of the rollout with located switching; NaN where no stencil stays on one side of
         every kink.
-      uncertainty: estimated error of the differences, of their shape.
-      crossings: number of gate crossings up to each horizon (n, k).
-      speed: speed of the gate's margin at the slowest of those [1/s] (n, k); infinite if there is none.
-      growth: spectral norm of d state / d start, in SI units (n, k).
-      flag: bits of `Flag` of the run with located switching (n,).
+      uncertainty: estimated error of the differences.
+      crossings: number of gate crossings up to each horizon.
+      speed: speed of the gate's margin at the slowest of those [1/s]; infinite if there is none.
+      growth: spectral norm of d state / d start, in SI units.
+      flag: bits of `Flag` of the run with located switching.
     """
 
     names: tuple[str, ...]
-    horizons: Numbers
+    horizons: Float[np.ndarray, " horizons"]
     temperatures: tuple[float, ...]
-    value: Numbers
-    located: Numbers
-    plain: Numbers
-    smooth: tuple[Numbers, ...]
-    difference: Numbers
-    uncertainty: Numbers
-    crossings: Numbers
-    speed: Numbers
-    growth: Numbers
-    flag: Numbers
+    value: Float[np.ndarray, "starts horizons"]
+    located: Derivatives
+    plain: Derivatives
+    smooth: tuple[Derivatives, ...]
+    difference: Derivatives
+    uncertainty: Derivatives
+    crossings: Int[np.ndarray, "starts horizons"]
+    speed: Float[np.ndarray, "starts horizons"]
+    growth: Float[np.ndarray, "starts horizons"]
+    flag: Int[np.ndarray, " starts"]
 
-    def errors(self, gradient: Numbers) -> Numbers:
-        """Returns |gradient - difference| / |difference| (n, k, d), see `SMALL_SHARE`; NaN where the difference is."""
+    def errors(self, gradient: Derivatives) -> Derivatives:
+        """Returns |gradient - difference| / |difference|, see `SMALL_SHARE`; NaN where the difference is."""
         size = np.abs(self.difference)
         distance = np.abs(gradient - self.difference)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(distance == 0.0, 0.0 * size, distance / np.maximum(size, SMALL_SHARE * self._largest()))
 
-    def wrong_signs(self, gradient: Numbers) -> Numbers:
-        """Returns where the gradient's sign (-1, 0, 1) differs from the difference's, if that is certain (n, k, d)."""
+    def wrong_signs(self, gradient: Derivatives) -> Verdicts:
+        """Returns where the gradient's sign (-1, 0, 1) differs from the difference's, if that is certain."""
         known = np.abs(self.difference) > np.maximum(self.uncertainty, SMALL_SHARE * self._largest())
         return known & (np.sign(gradient) != np.sign(self.difference))
 
     @property
-    def resolved(self) -> Numbers:
-        """Whether the differences are certain to `RESOLUTION` (n, k, d).
+    def resolved(self) -> Verdicts:
+        """Whether the differences are certain to `RESOLUTION`.
 
         Next to a kink (a crossing that appears or vanishes with a small step of a parameter) only the smallest stencils
         stay on one side of it, and rounding dominates those.
         """
         with np.errstate(invalid="ignore"):
             size = np.maximum(np.abs(self.difference), SMALL_SHARE * self._largest())
-            resolved: Numbers = self.uncertainty <= RESOLUTION * size
+            resolved: Verdicts = self.uncertainty <= RESOLUTION * size
             return resolved
 
-    def _largest(self) -> Numbers:
+    def _largest(self) -> Float[np.ndarray, "starts horizons 1"]:
         size = np.abs(self.difference)
-        largest: Numbers = np.max(np.where(np.isnan(size), 0.0, size), axis=-1, keepdims=True)
+        largest: Float[np.ndarray, "starts horizons 1"] = np.max(
+            np.where(np.isnan(size), 0.0, size), axis=-1, keepdims=True
+        )
         return largest
 
     @property
-    def trusted(self) -> Numbers:
-        """Whether the verdict on an initial state is "trustworthy" (n,)."""
+    def trusted(self) -> Bool[np.ndarray, " starts"]:
+        """Whether the verdict on an initial state is "trustworthy"."""
         return np.array([kind == "trustworthy" for kind, _ in self.verdicts])
 
     @property
-    def compared(self) -> Numbers:
-        """Which derivatives are compared: of trustworthy initial states, where the difference is resolved (n, k, d)."""
-        compared: Numbers = self.trusted[:, None, None] & self.resolved
+    def compared(self) -> Verdicts:
+        """Which derivatives are compared: of trustworthy initial states, where the difference is resolved."""
+        compared: Verdicts = self.trusted[:, None, None] & self.resolved
         return compared
 
     @property
@@ -152,7 +161,7 @@ class GradientAudit:
 
 def audit_gradients(
     build: Build,
-    parameters: Mapping[str, Any],
+    parameters: Mapping[str, Real[ArrayLike, "..."]],
     starts: State,
     *,
     duration: float = 4.0,
@@ -199,13 +208,15 @@ def audit_gradients(
         TimeOutside() if objective is None else objective, jnp.asarray(ends + 0.25 * dt, dtype), jnp.asarray(dt, dtype)
     )
 
-    def made(vector: jax.Array) -> tuple[CartPole, Hybrid]:
+    def made(vector: Float[Array, " parameters"]) -> tuple[CartPole, Hybrid]:
         plant, controller = build(as_tree(vector, shapes))
         if not isinstance(controller, Hybrid):
             raise InputError("build", controller, "one that makes a cpjax.Hybrid")
         return plant, controller
 
-    def probe(vector: jax.Array, start: State, switching: Any, temperature: Any) -> tuple[Probe, jax.Array]:
+    def probe(
+        vector: Float[Array, " parameters"], start: State, switching: Switching, temperature: Scalar | None
+    ) -> tuple[Probe, Int[Array, ""]]:
         plant, controller = made(vector)
         law: Any = controller
         if temperature is not None:
@@ -216,11 +227,13 @@ def audit_gradients(
         how: dict[str, Any] = {"duration": duration, "dt": dt, "clock": "continuous", "switching": switching}
         if switching == "per_step":
             how["derivative"] = "pathwise"  # its error is what the audit measures
-        found: tuple[Probe, jax.Array] = measure(plant, law, start, metrics=fold, **how)
+        found: tuple[Probe, Int[Array, ""]] = measure(plant, law, start, metrics=fold, **how)
         return found
 
-    def jacobians(switching: Any, arguments: tuple[int, ...]) -> Any:
-        def of_all(vector: jax.Array, start: jax.Array, temperature: Any) -> tuple[Any, Any]:
+    def jacobians(switching: Switching, arguments: tuple[int, ...]) -> Any:
+        def of_all(
+            vector: Float[Array, " parameters"], start: Float[Array, "4"], temperature: Scalar | None
+        ) -> tuple[Any, Any]:
             found, flag = probe(vector, State.from_vector(start), switching, temperature)
             return (found.value, found.state), (found, flag)
 
@@ -267,16 +280,21 @@ def audit_gradients(
 
 
 def _differences(
-    probe: Callable[..., Any], x: Numbers, starts: State, scale: Numbers, found: Probe, report: Callable[[str], None]
+    probe: Callable[..., Any],
+    x: Float[np.ndarray, "starts parameters"],
+    starts: State,
+    scale: Float[np.ndarray, "starts parameters"],
+    found: Probe,
+    report: Callable[[str], None],
 ) -> Differences:
-    """Returns differences of the rollout with located switching, with respect to relative changes (n, k, d)."""
+    """Returns differences of the rollout with located switching, with respect to relative changes."""
     n, d = x.shape
     run = jax.jit(jax.vmap(lambda vector, start: probe(vector, start, "located", None)[0]))
     many = jax.tree.map(lambda column: jnp.repeat(column, 2 * d), starts)
     moves = np.stack([np.eye(d), -np.eye(d)])  # (2, d, d)
-    same: dict[float, Numbers] = {}
+    same: dict[float, Verdicts] = {}
 
-    def ends(step: float) -> tuple[Numbers, Numbers]:
+    def ends(step: float) -> tuple[Derivatives, Derivatives]:
         report(f"differences with steps of {step:.0e}")
         points = x[:, None, None] + step * scale[:, None, None] * moves
         there = run(jnp.asarray(points.reshape(n * 2 * d, d), jnp.asarray(starts.x).dtype), many)
@@ -288,7 +306,7 @@ def _differences(
     return central_differences(ends, _STEPS, lambda step: same[step])
 
 
-def _horizons(given: Sequence[float] | None, duration: float, dt: float) -> Numbers:
+def _horizons(given: Sequence[float] | None, duration: float, dt: float) -> Float[np.ndarray, " horizons"]:
     steps = round(duration / dt)
     if given is None:
         return dt * np.unique(np.maximum(1, np.round(steps * np.arange(1, 5) / 4.0)))

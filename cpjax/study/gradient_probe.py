@@ -1,36 +1,37 @@
 """Metric of the gradient audit: an objective at several horizons, and the crossings up to each."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, UInt32
 
 from cpjax.pytree import part, pytree
 from cpjax.sim.closed_loop import GATE_CROSSING
-from cpjax.sim.metrics import Fold, Sample
+from cpjax.sim.metrics import Fold, MetricState, Sample
 
 
 class Probe(NamedTuple):
-    """Records at the k horizons, the first axis."""
+    """Records at the horizons."""
 
-    value: jax.Array
-    """Objective (k,)."""
-    state: jax.Array
-    """State of the plant (k, 4) [SI]."""
-    crossings: jax.Array
-    """Number of gate crossings so far (k,), int32."""
-    speed: jax.Array
-    """Slowest speed of the gate's margin at those (k,) [1/s]; infinite if there is none."""
-    path: jax.Array
-    """Hash (k,), uint32, of the sequence of crossings, of gate and supply, and of the steps in which they lie. Steps
+    value: Float[Array, "*horizons"]
+    """Objective."""
+    state: Float[Array, "*horizons 4"]
+    """State of the plant [SI]."""
+    crossings: Int[Array, "*horizons"]
+    """Number of gate crossings so far, int32."""
+    speed: Float[Array, "*horizons"]
+    """Slowest speed of the gate's margin at those [1/s]; infinite if there is none."""
+    path: UInt32[Array, "*horizons"]
+    """Hash of the sequence of crossings, of gate and supply, and of the steps in which they lie. Steps
     count because the samples' states, and sums over them, have a (small) kink where a crossing passes a sample."""
 
 
 class _Memory(NamedTuple):
-    objective: Any
-    crossings: jax.Array
-    speed: jax.Array
-    path: jax.Array
+    objective: MetricState
+    crossings: Int[Array, ""]
+    speed: Float[Array, ""]
+    path: UInt32[Array, ""]
     probe: Probe
 
 
@@ -39,9 +40,9 @@ class HorizonRecorder:
     """Metric that records an objective, the state and the crossings at several horizons."""
 
     objective: Fold = part("a fold", "init", "update", "finish")
-    horizons: Any = None
-    """Times of the records (k,) [s]."""
-    dt: Any = None
+    horizons: Float[Array, " horizons"]
+    """Times of the records [s]."""
+    dt: Float[Array, ""]
     """Step of the rollout [s]."""
 
     def init(self, sample: Sample) -> _Memory:
@@ -72,5 +73,5 @@ class HorizonRecorder:
         )
         return _Memory(objective, crossings, speed, path, probe)
 
-    def finish(self, memory: _Memory, last: Sample) -> tuple[Probe, jax.Array]:
+    def finish(self, memory: _Memory, last: Sample) -> tuple[Probe, Int[Array, ""]]:
         return memory.probe, last.flag

@@ -5,9 +5,9 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Real
 
 from cpjax.controllers import Hybrid, LqrWeights, PoleFactors, StateFeedback
 from cpjax.controllers.protocol import Controller, Law
@@ -17,8 +17,7 @@ from cpjax.linear.placement import place_polynomial
 from cpjax.plant import CartPole, linearize, with_parameters
 from cpjax.pytree import numbers
 
-Numbers: TypeAlias = np.ndarray[Any, Any]
-Build: TypeAlias = Callable[[Mapping[str, jax.Array]], tuple[CartPole, Controller | Law]]
+Build: TypeAlias = Callable[[Mapping[str, Float[Array, "..."]]], tuple[CartPole, Controller | Law]]
 """Function from parameters by name, possibly traced, to plant and controller."""
 
 
@@ -26,7 +25,7 @@ class Parametrisation(NamedTuple):
     """Arguments of `audit_gradients`."""
 
     build: Build
-    parameters: dict[str, Any]
+    parameters: dict[str, Float[ArrayLike, "..."]]
     scales: dict[str, float]
 
 
@@ -66,7 +65,7 @@ def parametrise(plant: CartPole, controller: Hybrid) -> Parametrisation:
     else:
         parameters["K"] = np.asarray(controller.regulator.K, dtype=np.float64)[0]
 
-    def build(p: Mapping[str, jax.Array]) -> tuple[CartPole, Hybrid]:
+    def build(p: Mapping[str, Float[Array, "..."]]) -> tuple[CartPole, Hybrid]:
         if "Q" in p:
             K = lqr(A, B, jnp.diag(p["Q"]), p["R"]).K
         else:
@@ -85,8 +84,10 @@ def parametrise(plant: CartPole, controller: Hybrid) -> Parametrisation:
     return Parametrisation(build, parameters, scales)
 
 
-def as_matrix(parameters: Mapping[str, Any], n: int, each: bool) -> tuple[tuple[str, ...], Numbers, Any]:
-    """Returns names of the elements (d), values (n, d), and the shapes from which `as_tree` restores the mapping.
+def as_matrix(
+    parameters: Mapping[str, Real[ArrayLike, "..."]], n: int, each: bool
+) -> tuple[tuple[str, ...], Float[np.ndarray, "starts parameters"], Any]:
+    """Returns names of the elements, values, and the shapes from which `as_tree` restores the mapping.
 
     Args:
       parameters: numbers and vectors by name.
@@ -116,8 +117,8 @@ def as_matrix(parameters: Mapping[str, Any], n: int, each: bool) -> tuple[tuple[
     return tuple(names), np.concatenate(columns, axis=1), tuple(shapes)
 
 
-def as_tree(vector: jax.Array, shapes: Any) -> dict[str, jax.Array]:
-    """Returns the mapping from one row (d,) of values and the shapes that `as_matrix` returned."""
+def as_tree(vector: Float[Array, " parameters"], shapes: Any) -> dict[str, Float[Array, "..."]]:
+    """Returns the mapping from one row of values and the shapes that `as_matrix` returned."""
     tree, at = {}, 0
     for name, shape in shapes:
         size = math.prod(shape)
@@ -126,12 +127,14 @@ def as_tree(vector: jax.Array, shapes: Any) -> dict[str, jax.Array]:
     return tree
 
 
-def parameter_scales(names: tuple[str, ...], x: Numbers, given: Mapping[str, float]) -> Numbers:
-    """Returns the change of each element (n, d) that counts as a relative change by 1: given, or its magnitude.
+def parameter_scales(
+    names: tuple[str, ...], x: Float[np.ndarray, "starts parameters"], given: Mapping[str, float]
+) -> Float[np.ndarray, "starts parameters"]:
+    """Returns the change of each element that counts as a relative change by 1: given, or its magnitude.
 
     Args:
-      names: of the elements, d.
-      x: values (n, d).
+      names: of the elements.
+      x: values.
       given: changes by name, of a parameter or of an element such as "Q[0]".
 
     Raises:

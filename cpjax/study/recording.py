@@ -10,12 +10,13 @@ from typing import Any, Unpack
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
+from jaxtyping import Shaped
 
 from cpjax import archive, files, io
 from cpjax.controllers.protocol import Controller, Law, ModalController, as_controller
 from cpjax.errors import InputError
 from cpjax.sim.metrics import Fold
-from cpjax.sim.plants import Plant
+from cpjax.sim.plants import Plant, PlantState
 from cpjax.sim.rollout import default_metrics
 from cpjax.sim.settings import Simulation, check_names
 from cpjax.sim.sweep import Progress, SweepPlan, prepare
@@ -32,7 +33,7 @@ def record_sweep(
     path: str | Path,
     plant: Plant,
     controller: Controller | ModalController | Law,
-    starts: Any,
+    starts: PlantState,
     *,
     metrics: Fold | None = None,
     about: Mapping[str, Any] | None = None,
@@ -119,11 +120,11 @@ def _record(
     return [blocks[begin] for begin in names] if parts is not None else []
 
 
-def read_sweep(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def read_sweep(path: str | Path) -> tuple[dict[str, Any], dict[str, Shaped[np.ndarray, "starts ..."]]]:
     """Reads a file of metrics that `record_sweep` wrote.
 
     Returns:
-      The document, and the columns (n, ...) by name: initial states ("start." and the component) and metrics.
+      The document, and the columns by name: initial states ("start." and the component) and metrics.
 
     Raises:
       InputError: no such file, not one of `record_sweep`'s, or one whose content has changed since.
@@ -153,8 +154,8 @@ def read_sweep(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]
     return document, columns
 
 
-def _column(column: Any) -> np.ndarray[Any, Any]:
-    """Returns a column of a Parquet table (n,) or, of lists, (n, ...)."""
+def _column(column: Any) -> Shaped[np.ndarray, "starts ..."]:
+    """Returns a column of a Parquet table; of lists, with their axes."""
     values = column.combine_chunks().to_numpy(zero_copy_only=False)
     return np.stack([np.asarray(row.tolist()) for row in values]) if values.dtype == object else values
 
@@ -196,12 +197,12 @@ def _fingerprint(work: SweepPlan) -> str:
     return hashlib.sha256(f"{structure} {leaves}".encode()).hexdigest()
 
 
-def _starts(work: SweepPlan, begin: int, end: int) -> dict[str, np.ndarray]:
+def _starts(work: SweepPlan, begin: int, end: int) -> dict[str, Shaped[np.ndarray, "starts ..."]]:
     columns = zip(work.names, work.leaves, strict=False)  # the initial state's leaves come first
     return {f"start.{name}": np.asarray(column)[begin:end] for name, column in columns}
 
 
-def _columns(result: Any) -> dict[str, np.ndarray]:
+def _columns(result: Any) -> dict[str, Shaped[np.ndarray, "starts ..."]]:
     columns = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(result):
         name = jax.tree_util.keystr(path, simple=True, separator=".") or "result"

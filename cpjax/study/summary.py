@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from cpjax.numeric.statistics import wilson_interval
 from cpjax.sim.flags import Flag
@@ -44,7 +45,7 @@ def summarise(metrics: Metrics) -> dict[str, Any]:
     }
 
 
-def _spread(values: np.ndarray[Any, Any]) -> dict[str, float]:
+def _spread(values: Float[np.ndarray, " starts"]) -> dict[str, float]:
     if values.size == 0:
         return dict.fromkeys(("mean", "median", "max"), float("nan"))
     return {"mean": float(values.mean()), "median": float(np.median(values)), "max": float(values.max())}

@@ -4,11 +4,12 @@ import dataclasses
 import math
 import operator
 from collections import Counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
 
 from cpjax.controllers import DesignName, EnergySwingUp
 from cpjax.controllers.feedback import without_design
@@ -16,14 +17,13 @@ from cpjax.numeric.pareto import nondominated
 from cpjax.plant import CartPole, with_parameters
 from cpjax.plant.initial_states import sample_starts
 from cpjax.plant.state import State
+from cpjax.pytree import Scalar
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.sweep import sweep
 from cpjax.study.fronts.config import COSTS, FrontConfig
 from cpjax.tune.baseline import baseline
 from cpjax.tune.descent import derive_seed, in_blocks
 from cpjax.tune.parameters import FreeParameters, free_parameters
-
-Numbers = np.ndarray[Any, Any]
 
 SCREEN, BATCH, EVALUATION, REEVALUATION, FINAL, CANDIDATES, EXPLORE = range(7)
 """Purposes of random numbers."""
@@ -32,19 +32,19 @@ _RUNS, _CONTROLLERS = 2048, 64  # batch sizes: runs simulated, and controllers d
 
 
 class Evaluated(NamedTuple):
-    """n controllers and their metrics."""
+    """Controllers and their metrics."""
 
-    vectors: Numbers
-    """Free parameters, unconstrained (n, d)."""
-    success: Numbers
-    """Share of the initial states that each settles from (n,)."""
-    time: Numbers
-    """Mean settling time over those [s] (n,); infinite if there is none."""
-    costs: Numbers
-    """Mean of each of `COSTS` over those (n, number of costs); infinite if there is none."""
+    vectors: Float[np.ndarray, "controllers parameters"]
+    """Free parameters, unconstrained."""
+    success: Float[np.ndarray, " controllers"]
+    """Share of the initial states that each settles from."""
+    time: Float[np.ndarray, " controllers"]
+    """Mean settling time over those [s]; infinite if there is none."""
+    costs: Float[np.ndarray, "controllers costs"]
+    """Mean of each of `COSTS` over those; infinite if there is none."""
 
-    def points(self, cost: str, success: float) -> Numbers:
-        """Returns settling time and cost (n, 2); infinite for those that settle from a smaller share than `success`."""
+    def points(self, cost: str, success: float) -> Float[np.ndarray, "controllers 2"]:
+        """Returns settling time and cost; infinite for those that settle from a smaller share than `success`."""
         found = np.stack([self.time, self.costs[:, COSTS.index(cost)]], axis=1)
         found[self.success < success] = np.inf
         return found
@@ -54,7 +54,9 @@ class Evaluated(NamedTuple):
         best = float(np.max(self.success))
         return wanted if best >= wanted else 0.97 * best
 
-    def fastest(self, cost: str, bound: float, success: float, rank: int = 0) -> tuple[Numbers, float]:
+    def fastest(
+        self, cost: str, bound: float, success: float, rank: int = 0
+    ) -> tuple[Float[np.ndarray, " parameters"], float]:
         """Returns the fastest controller within a bound on a cost, and its settling time.
 
         If none is within the bound, returns the one with the least cost, and infinity.
@@ -66,7 +68,7 @@ class Evaluated(NamedTuple):
           rank: 0 for the best, 1 for the second, and so on; at most the last.
 
         Returns:
-          Free parameters (d,) and mean settling time [s].
+          Free parameters and mean settling time [s].
         """
         time, spent = self.points(cost, self.threshold(success)).T
         within = np.flatnonzero((spent <= bound) & np.isfinite(time))
@@ -75,8 +77,8 @@ class Evaluated(NamedTuple):
         found = int(among[np.argsort(worth[among], kind="stable")[min(rank, len(among) - 1)]])
         return self.vectors[found], float(time[found]) if len(within) else math.inf
 
-    def epsilon_grid(self, cost: str, plan: FrontConfig) -> Numbers:
-        """Returns bounds on a cost (bounds + 1,), see `FrontConfig.bounds`; the last one is infinite."""
+    def epsilon_grid(self, cost: str, plan: FrontConfig) -> Float[np.ndarray, " bounds"]:
+        """Returns bounds on a cost, see `FrontConfig.bounds`; the last one is infinite."""
         points = self.points(cost, self.threshold(plan.success))
         points = points[np.isfinite(points[:, 0])]
         if not len(points):
@@ -99,11 +101,11 @@ class Evaluator:
         self.steps: Counter[float] = Counter()
         self._built = jax.jit(jax.vmap(lambda vector, supply: without_design(self.free_at(supply).build(vector))))
 
-    def plant_at(self, supply: Any) -> CartPole:
+    def plant_at(self, supply: Scalar) -> CartPole:
         """Returns the plant with another voltage limit [V]."""
         return with_parameters(self._plant, {"voltage_limit": supply})
 
-    def free_at(self, supply: Any) -> FreeParameters:
+    def free_at(self, supply: Scalar) -> FreeParameters:
         """Returns the free parameters of controllers whose law's model has this voltage limit [V]."""
         controller = self.free.controller
         law = controller.swing_up
@@ -116,11 +118,13 @@ class Evaluator:
         seed = derive_seed(self._plan.seed, purpose, number)
         return sample_starts("hanging", count, seed=seed, dtype=np.dtype(jnp.result_type(float)))
 
-    def evaluate(self, vectors: Numbers, supply: float, count: int, purpose: int) -> Evaluated:
+    def evaluate(
+        self, vectors: Float[np.ndarray, "controllers parameters"], supply: float, count: int, purpose: int
+    ) -> Evaluated:
         """Evaluates controllers by the protocol's metrics, all from the same initial states.
 
         Args:
-          vectors: free parameters (n, d).
+          vectors: free parameters.
           supply: voltage limit [V].
           count: number of initial states.
           purpose: `REEVALUATION` and `FINAL` use `final_dt`, others `evaluation_dt`; each has its own initial states.
@@ -129,7 +133,7 @@ class Evaluator:
         dt = plan.final_dt if purpose in (REEVALUATION, FINAL) else plan.evaluation_dt
         controllers = in_blocks(self._built, _CONTROLLERS, vectors, np.full(len(vectors), supply, vectors.dtype))
 
-        def run(which: Numbers, start: Numbers) -> Metrics:
+        def run(which: Int[np.ndarray, " runs"], start: Int[np.ndarray, " runs"]) -> Metrics:
             found: Metrics = sweep(
                 plant,
                 jax.tree.map(operator.itemgetter(which), controllers),
@@ -146,7 +150,7 @@ class Evaluator:
         good = table.success > 0.0
         total = np.sum(good, axis=1)
 
-        def mean(column: Numbers) -> Numbers:
+        def mean(column: Float[np.ndarray, "controllers starts"]) -> Float[np.ndarray, " controllers"]:
             summed = np.sum(np.where(good, column, 0.0), axis=1)
             return np.where(total > 0, summed / np.maximum(total, 1), np.inf)
 
@@ -177,11 +181,11 @@ class Evaluator:
         return self.evaluate(screened.vectors[sorted(better)], supply, plan.evaluation, EVALUATION)
 
 
-def nondominated_sort(points: Numbers, least: int) -> Numbers:
+def nondominated_sort(points: Float[np.ndarray, "points 2"], least: int) -> Int[np.ndarray, " chosen"]:
     """Returns indices of points by non-dominated sorting: the first fronts that together hold at least `least` points.
 
     Args:
-      points: two costs of each point (n, 2); points that are not finite are left out.
+      points: two costs of each point; points that are not finite are left out.
       least: wanted number of points; fewer if there are not so many. The first point alone if none is finite.
     """
     left, chosen = np.array(points), np.zeros(0, int)

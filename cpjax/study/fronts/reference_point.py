@@ -2,9 +2,10 @@
 
 import dataclasses
 import math
-from typing import Any, get_args
+from typing import TypeAlias, get_args
 
 import numpy as np
+from jaxtyping import Float
 
 from cpjax.controllers import DesignName
 from cpjax.errors import InputError
@@ -12,7 +13,8 @@ from cpjax.plant import CartPole
 from cpjax.study.fronts.config import COSTS, FrontConfig, Objective
 from cpjax.study.fronts.evaluator import FINAL, Evaluator
 
-Numbers = np.ndarray[Any, Any]
+Point: TypeAlias = Float[np.ndarray, "2"]
+"""Mean settling time [s] and mean cost."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,14 +22,14 @@ class ReferencePoints:
     """Reference points of the hypervolumes, the same for all designs.
 
     Attributes:
-      baseline: for each design the baseline controller's settling time [s] and cost (2,) by (supply, cost); NaN where
+      baseline: for each design the baseline controller's settling time [s] and cost by (supply, cost); NaN where
         it settles from less than half of the initial states.
-      reference: reference point (2,) by (supply, cost): in each coordinate 1.1 times the worst of the baselines; where
+      reference: reference point by (supply, cost): in each coordinate 1.1 times the worst of the baselines; where
         there is none, the reference point at the plant's own supply.
     """
 
-    baseline: dict[DesignName, dict[Objective, Numbers]]
-    reference: dict[Objective, Numbers]
+    baseline: dict[DesignName, dict[Objective, Point]]
+    reference: dict[Objective, Point]
 
 
 def objectives(plant: CartPole, supplies: tuple[float, ...] = ()) -> list[Objective]:
@@ -56,7 +58,7 @@ def reference_points(plant: CartPole, plan: FrontConfig, supplies: tuple[float, 
         initial states.
     """
     wanted = objectives(plant, supplies)
-    baseline: dict[DesignName, dict[Objective, Numbers]] = {}
+    baseline: dict[DesignName, dict[Objective, Point]] = {}
     for design in get_args(DesignName):
         evaluator = Evaluator(plant, design, plan)
         start = np.asarray(evaluator.free.start())[None]
@@ -67,7 +69,7 @@ def reference_points(plant: CartPole, plan: FrontConfig, supplies: tuple[float, 
             objective: np.where(np.isfinite(point := found[objective[0]].points(objective[1], 0.5)[0]), point, np.nan)
             for objective in wanted
         }
-    reference: dict[Objective, Numbers] = {}
+    reference: dict[Objective, Point] = {}
     own = wanted[0][0]
     for objective in wanted:
         points = np.array([of[objective] for of in baseline.values()])

@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Bool, Float, Shaped
 
 from cpjax.controllers import DesignName
 from cpjax.numeric.pareto import hypervolume, nondominated
@@ -45,12 +46,12 @@ from cpjax.study.fronts.evaluator import (
     concatenate,
     nondominated_sort,
 )
-from cpjax.study.fronts.reference_point import objectives
+from cpjax.study.fronts.reference_point import Point, objectives
 from cpjax.tune import descent
 from cpjax.tune.objective import Effort, Lagrangian, RemainingTime, Travel, VoltageVariation
+from cpjax.tune.parameters import Vector
 from cpjax.workspace import Workspace
 
-Numbers = np.ndarray[Any, Any]
 Report = Callable[[int, int, str], None]
 GRADIENT_STEP = 60.0
 """Steps of values on the fastest path that take as long as one gradient step here (`experiments/tuner_cost.py`)."""
@@ -64,16 +65,16 @@ class Front:
     """Front of one cost and one supply, from one kind of search.
 
     Attributes:
-      points: mean settling time [s] and mean cost (n, 2) over the successes of the final evaluation; by rising time.
-      success: share of the final evaluation's initial states that each settles from (n,).
-      vectors: the controllers' free parameters, unconstrained (n, d).
+      points: mean settling time [s] and mean cost over the successes of the final evaluation; by rising time.
+      success: share of the final evaluation's initial states that each settles from.
+      vectors: the controllers' free parameters, unconstrained.
       volume: hypervolume up to the reference point.
       best_success: the largest share of the re-evaluation's initial states that any controller settles from.
     """
 
-    points: Numbers
-    success: Numbers
-    vectors: Numbers
+    points: Float[np.ndarray, "points 2"]
+    success: Float[np.ndarray, " points"]
+    vectors: Float[np.ndarray, "points parameters"]
     volume: float
     best_success: float
 
@@ -100,7 +101,7 @@ def trace_fronts(
     plant: CartPole,
     design: DesignName,
     plan: FrontConfig,
-    reference: Mapping[Objective, Numbers],
+    reference: Mapping[Objective, Point],
     *,
     supplies: tuple[float, ...] = (),
     report: Report,
@@ -112,7 +113,7 @@ def trace_fronts(
       plant: the plant.
       design: "lqr" or "placement".
       plan: the configuration.
-      reference: reference points of the hypervolumes (2,) by (supply, cost); see `reference_points`.
+      reference: reference points of the hypervolumes by (supply, cost); see `reference_points`.
       supplies: further voltage limits [V].
       report: called with the parts done, their number, and the current part in words.
       memory: a workspace in which each of the two searches is saved when it is done. A call that finds one there does
@@ -173,7 +174,7 @@ def trace_fronts(
 
 
 def _front(
-    evaluator: Evaluator, plan: FrontConfig, archive: Evaluated, supply: float, cost: str, reference: Numbers
+    evaluator: Evaluator, plan: FrontConfig, archive: Evaluated, supply: float, cost: str, reference: Point
 ) -> Front:
     """Returns the front of an archive, measured once more from unseen initial states."""
     # Few initial states do not resolve a failure rate of 1 %: those with a few failures are re-evaluated too.
@@ -198,9 +199,9 @@ def _front(
 class Aim(NamedTuple):
     """Objective of one tuning: multipliers and supply."""
 
-    multipliers: jax.Array
+    multipliers: Float[Array, "*tunings costs"]
     """Multiplier of each of `COSTS` [s per unit of the cost]; zero but for the one that has a finite bound."""
-    supply: jax.Array
+    supply: Float[Array, "*tunings"]
     """Voltage limit [V]."""
 
 
@@ -281,15 +282,15 @@ class Tracer:
             report(step + 1, f"{len(jobs)} tunings side by side")
         return archive
 
-    def _slope(self, vector: jax.Array, aim: Aim, starts: State) -> tuple[jax.Array, jax.Array]:
-        """Returns the gradient (d,), norm-clipped per initial state and then averaged; and the mean costs."""
+    def _slope(self, vector: Vector, aim: Aim, starts: State) -> tuple[Vector, Float[Array, " costs"]]:
+        """Returns the gradient, norm-clipped per initial state and then averaged; and the mean costs."""
         plan, plant, free = self._plan, self._evaluator.plant_at(aim.supply), self._evaluator.free_at(aim.supply)
         costs = (FOLDS[cost] for cost in COSTS)
         terms = (TimeOutside(plan.width, plan.width), *costs, RemainingTime(plan.duration))
         fold = Lagrangian(terms, tuple(aim.multipliers), plan.stop_penalty)
 
-        def objective(vector: jax.Array, start: State) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-            found: tuple[jax.Array, tuple[jax.Array, ...]] = measure(
+        def objective(vector: Vector, start: State) -> tuple[Float[Array, ""], tuple[Float[Array, ""], ...]]:
+            found: tuple[Float[Array, ""], tuple[Float[Array, ""], ...]] = measure(
                 plant,
                 free.build(vector),
                 start,
@@ -308,6 +309,6 @@ class Tracer:
         return slope, jnp.mean(jnp.nan_to_num(jnp.stack(spent, axis=1)), axis=0)
 
 
-def _forgotten(leaf: jax.Array, rows: Numbers) -> jax.Array:
+def _forgotten(leaf: Shaped[Array, "*leaf"], rows: Bool[np.ndarray, " rows"]) -> Shaped[Array, "*leaf"]:
     """Returns a leaf of the optimiser's state with some rows of its moments reset to zero."""
     return jnp.where(rows[:, None], 0.0, leaf).astype(leaf.dtype) if leaf.ndim == 2 else leaf
