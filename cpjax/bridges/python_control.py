@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, ArrayLike, Float, Real
 
 from cpjax.bridges.known import UNTRACEABLE, concrete_plant, require_concrete, unexpressed
 from cpjax.controllers.feedback import StateFeedback
@@ -28,7 +29,11 @@ from cpjax.sim.integrators import rk4
 from cpjax.sim.settings import check_settings
 from cpjax.sim.stepper import applied_voltage, step_held
 
-Vector: TypeAlias = np.ndarray[Any, Any]
+Vector: TypeAlias = Float[np.ndarray, " states"]
+"""State of a system of python-control."""
+
+Gain: TypeAlias = Real[ArrayLike, "1 4"] | Real[ArrayLike, "4"] | control.StateSpace
+"""A gain that python-control computed, or its static system."""
 
 MEASURED = ("x", "theta")
 """The paper's measurements, cart position and angle: `outputs` of `state_space` for the design of an observer."""
@@ -76,7 +81,9 @@ def plant_system(plant: CartPole) -> control.NonlinearIOSystem:
     plant = concrete_plant(plant)
     saturate = _saturation(plant.motor)
 
-    def update(t: float, state: Vector, inputs: Vector, params: Any) -> tuple[Any, ...]:
+    def update(
+        t: float, state: Vector, inputs: Float[np.ndarray, " inputs"], params: Any
+    ) -> tuple[float, float, float, float]:
         return _derivative(plant, state, saturate(float(inputs[0])))
 
     return control.NonlinearIOSystem(
@@ -123,8 +130,8 @@ def closed_loop_system(
     return _continuous_loop(plant, controller)
 
 
-def gain_array(law: StateFeedback) -> Vector:
-    """Returns K of u = -K s as python-control writes it, an array (1, 4) [V per unit of state].
+def gain_array(law: StateFeedback) -> Float[np.ndarray, "1 4"]:
+    """Returns K of u = -K s as python-control writes it [V per unit of state].
 
     The law takes the angle modulo a turn, which a gain cannot: the two agree within half a turn of upright.
 
@@ -146,7 +153,7 @@ def feedback_system(law: StateFeedback) -> control.StateSpace:
     return control.StateSpace([], [], [], -gain_array(law), inputs=list(NAMES), outputs=["voltage"])
 
 
-def state_feedback(gain: Any) -> StateFeedback:
+def state_feedback(gain: Gain) -> StateFeedback:
     """Returns the law u = -K s of a gain that python-control computed.
 
     Args:
@@ -172,7 +179,7 @@ def state_feedback(gain: Any) -> StateFeedback:
     return StateFeedback(K.astype(np.float64))
 
 
-def _derivative(plant: CartPole, state: Vector, voltage: float) -> tuple[Any, ...]:
+def _derivative(plant: CartPole, state: Vector, voltage: float) -> tuple[float, float, float, float]:
     """Computes `vector_field` of any plant of Python floats under the applied voltage [V], as Python floats."""
     _, x_dot, theta, theta_dot = state.tolist()
     # A plant or motor that uses JAX's functions returns arrays; without float64 they would be float32.
@@ -200,12 +207,14 @@ def _continuous_loop(plant: CartPole, controller: ModalController) -> control.No
     arrays, controller = cast((plant, controller), dtype)
 
     @jax.jit
-    def act(vector: jax.Array) -> jax.Array:
+    def act(vector: Float[Array, " states"]) -> Float[Array, "2"]:
         state = State.from_vector(vector.astype(dtype))
         mode = controller.start_mode(state)
         return jnp.stack([applied_voltage(arrays, controller, state, mode), mode.astype(dtype)])
 
-    def update(t: float, state: Vector, inputs: Vector, params: Any) -> tuple[Any, ...]:
+    def update(
+        t: float, state: Vector, inputs: Float[np.ndarray, " inputs"], params: Any
+    ) -> tuple[float, float, float, float]:
         return _derivative(plant, state, np.asarray(act(state))[0].item())
 
     return _loop_system(update, act, NAMES, 0)
@@ -220,33 +229,33 @@ def _sampled_loop(plant: CartPole, controller: ModalController, period: Any, dt:
     dtype = jnp.result_type(float)
     plant, controller, step = cast((plant, controller, float(dt)), dtype)
 
-    def observe(vector: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+    def observe(vector: Float[Array, "5"]) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
         state = State.from_vector(vector[:4].astype(dtype))
         mode = controller.next_mode(state, vector[4].astype(jnp.int32))
         return state, applied_voltage(plant, controller, state, mode), mode.astype(dtype)
 
     @jax.jit
-    def act(vector: jax.Array) -> jax.Array:
+    def act(vector: Float[Array, " states"]) -> Float[Array, "2"]:
         return jnp.stack(observe(vector)[1:])
 
     @jax.jit
-    def advance(vector: jax.Array) -> jax.Array:
+    def advance(vector: Float[Array, "5"]) -> Float[Array, "5"]:
         state, voltage, mode = observe(vector)
         state = lax.fori_loop(0, steps, lambda _, state: step_held(plant, rk4, state, voltage, step), state)
         return jnp.append(state.vector(), mode)
 
-    def update(t: float, state: Vector, inputs: Vector, params: Any) -> Vector:
+    def update(t: float, state: Vector, inputs: Float[np.ndarray, " inputs"], params: Any) -> Vector:
         return np.asarray(advance(state))
 
     return _loop_system(update, act, (*NAMES, "mode"), period)
 
 
 def _loop_system(
-    update: Callable[..., Any], act: Callable[[Any], jax.Array], states: Sequence[str], dt: float
+    update: Callable[..., Any], act: Callable[[Vector], Float[Array, "2"]], states: Sequence[str], dt: float
 ) -> control.NonlinearIOSystem:
     """Builds the closed-loop system; `act` returns the applied voltage and the mode at a system's state."""
 
-    def output(t: float, state: Vector, inputs: Vector, params: Any) -> Vector:
+    def output(t: float, state: Vector, inputs: Float[np.ndarray, " inputs"], params: Any) -> Float[np.ndarray, "6"]:
         return np.concatenate([state[:4], act(state)])
 
     outputs = [*NAMES, "voltage", "mode"]

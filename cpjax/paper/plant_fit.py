@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float, Int
 
 from cpjax.numeric.small_matrices import linear_solve
 from cpjax.paper.printed_gains import PrintedGain
@@ -64,18 +65,21 @@ def scale_of(plant: CartPole, name: str) -> float:
     return float(parameter(plant, name)) or parameters_of(plant)[name].size(plant) or 1.0
 
 
-def _residuals(prints: Sequence[PrintedGain], plant: CartPole) -> jax.Array:
+def _residuals(prints: Sequence[PrintedGain], plant: CartPole) -> Float[Array, " residuals"]:
     gains = jnp.concatenate([p.computed(plant) for p in prints])
     printed = jnp.asarray([k for p in prints for k in p.gain], dtype=gains.dtype)
     return (gains - printed) / jnp.asarray([u for p in prints for u in p.unit], dtype=gains.dtype)
 
 
 def _with_derivatives(
-    prints: tuple[PrintedGain, ...], plant: CartPole, values: Callable[[jax.Array], Mapping[str, Any]], x: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Returns residuals (4 gains,) and derivatives (4 gains, n) by x (n,), on the plant changed to `values(x)`."""
+    prints: tuple[PrintedGain, ...],
+    plant: CartPole,
+    values: Callable[[Float[Array, " parameters"]], Mapping[str, Float[Array, ""]]],
+    x: Float[Array, " parameters"],
+) -> tuple[Float[Array, " residuals"], Float[Array, "residuals parameters"]]:
+    """Returns residuals and their derivatives by x, on the plant changed to `values(x)`."""
 
-    def twice(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def twice(x: Float[Array, " parameters"]) -> tuple[Float[Array, " residuals"], Float[Array, " residuals"]]:
         r = _residuals(prints, with_parameters(plant, values(x)))
         return r, r
 
@@ -86,27 +90,31 @@ def _with_derivatives(
 # Compiled for all parameters, whichever may change: one program serves every audit of the same number of gains.
 
 
-def linearised(prints: tuple[PrintedGain, ...], plant: CartPole) -> tuple[Any, Any]:
-    """Returns the residuals (4 gains,) on `plant` and their derivatives by all `PARAMETERS`, as NumPy arrays."""
+def linearised(
+    prints: tuple[PrintedGain, ...], plant: CartPole
+) -> tuple[Float[np.ndarray, " residuals"], Float[np.ndarray, "residuals parameters"]]:
+    """Returns the residuals on `plant` and their derivatives by all `PARAMETERS`, as NumPy arrays."""
     r, J = _compiled_linearisation(prints, *_numbers(plant))
     return np.asarray(r), np.asarray(J)
 
 
 @jax.jit
 def _compiled_linearisation(
-    prints: tuple[PrintedGain, ...], plant: CartPole, numbers: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+    prints: tuple[PrintedGain, ...], plant: CartPole, numbers: Float[Array, " parameters"]
+) -> tuple[Float[Array, " residuals"], Float[Array, "residuals parameters"]]:
     return _with_derivatives(prints, plant, lambda x: dict(zip(PARAMETERS, x, strict=True)), numbers)
 
 
-def _numbers(plant: CartPole) -> tuple[CartPole, jax.Array]:
+def _numbers(plant: CartPole) -> tuple[CartPole, Float[Array, " parameters"]]:
     """Returns the plant with arrays for numbers, and the values of all `PARAMETERS`, of one dtype."""
     numbers = jnp.asarray([float(parameter(plant, name)) for name in PARAMETERS])
     return cast(plant, numbers.dtype), numbers
 
 
-def random_starts(sets: Sequence[tuple[str, ...]], most: int, count: int, seed: int) -> np.ndarray[Any, Any]:
-    """Draws logarithms of factors (sets, count, most), from 1/3 to 3; those beyond a set's size are unused.
+def random_starts(
+    sets: Sequence[tuple[str, ...]], most: int, count: int, seed: int
+) -> Float[np.ndarray, "sets count most"]:
+    """Draws logarithms of factors, from 1/3 to 3; those beyond a set's size are unused.
 
     Args:
       sets: names of the parameters of each fit.
@@ -122,7 +130,7 @@ def fit_all(
     prints: tuple[PrintedGain, ...],
     plant: CartPole,
     sets: Sequence[tuple[str, ...]],
-    starts: np.ndarray[Any, Any],
+    starts: Float[np.ndarray, "sets count most"],
     progress: Progress | None,
 ) -> list[Fit]:
     """Fits each set of parameters from all its initial points, and returns the best fit of each.
@@ -131,7 +139,7 @@ def fit_all(
       prints: the gains.
       plant: the plant, which keeps the parameters that are not in a set.
       sets: names of the parameters of each fit, all in `PARAMETERS`.
-      starts: logarithms of factors (sets, count, most), see `random_starts`.
+      starts: logarithms of factors, see `random_starts`.
       progress: called with the sets done, their number, and the current work in words.
     """
     count, most = starts.shape[1:]
@@ -169,23 +177,25 @@ def fit_all(
 def _fitted(
     prints: tuple[PrintedGain, ...],
     plant: CartPole,
-    own: jax.Array,
-    base: jax.Array,
-    chosen: jax.Array,
-    starts: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Returns the fitted values (n, most) of the chosen parameters and the residuals (n, 4 gains) of n fits.
+    own: Float[Array, " parameters"],
+    base: Float[Array, " parameters"],
+    chosen: Int[Array, "fits most"],
+    starts: Float[Array, "fits most"],
+) -> tuple[Float[Array, "fits most"], Float[Array, "fits residuals"]]:
+    """Returns the fitted values of the chosen parameters and the residuals of all fits.
 
     Args:
-      own: values of all parameters on the plant, used for those not chosen (parameters,).
-      base: values that the exponentials of `starts` multiply (parameters,).
-      chosen: indices into `PARAMETERS`, or their number for none (n, most).
-      starts: initial points, logarithms of factors (n, most).
+      own: values of all parameters on the plant, used for those not chosen.
+      base: values that the exponentials of `starts` multiply.
+      chosen: indices into `PARAMETERS`, or their number for none.
+      starts: initial points, logarithms of factors.
     """
     own, base = jnp.append(own, 1.0), jnp.append(base, 1.0)
 
-    def one(chosen: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def values(x: jax.Array) -> dict[str, jax.Array]:
+    def one(
+        chosen: Int[Array, " most"], x: Float[Array, " most"]
+    ) -> tuple[Float[Array, " most"], Float[Array, " residuals"]]:
+        def values(x: Float[Array, " most"]) -> dict[str, Float[Array, ""]]:
             numbers = own.at[chosen].set(base[chosen] * jnp.exp(x))
             return dict(zip(PARAMETERS, numbers[:-1], strict=True))
 
@@ -196,17 +206,21 @@ def _fitted(
 
 
 def least_squares(
-    residuals: Callable[[jax.Array], tuple[jax.Array, jax.Array]], x: jax.Array, count: int
-) -> tuple[jax.Array, jax.Array]:
+    residuals: Callable[
+        [Float[Array, " parameters"]], tuple[Float[Array, " residuals"], Float[Array, "residuals parameters"]]
+    ],
+    x: Float[Array, " parameters"],
+    count: int,
+) -> tuple[Float[Array, " parameters"], Float[Array, " residuals"]]:
     """Minimises the residuals' sum of squares by the Levenberg-Marquardt method.
 
     Args:
-      residuals: maps x (n,) to residuals (count,) and their derivatives (count, n).
-      x: initial point (n,).
+      residuals: maps x to residuals and their derivatives.
+      x: initial point.
       count: number of residuals.
 
     Returns:
-      The best point found (n,), and the residuals there (count,), which are infinite if they are not finite at `x`.
+      The best point found, and the residuals there, which are infinite if they are not finite at `x`.
     """
 
     def step(carry: tuple[Any, ...], _: None) -> tuple[Any, None]:

@@ -8,8 +8,8 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Literal, TypeAlias, get_args
 
-import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.controllers.energy import EnergySwingUp
@@ -143,8 +143,8 @@ LAWS: Mapping[str, Callable[[CartPole], Law]] = {
 longer the paper's: the corrected law with a larger gain and with cart-centring terms."""
 
 
-def computed_gain(design: Design, plant: CartPole) -> jax.Array:
-    """Returns the gain (1, 4) that the paper's poles or weights give on `plant`; differentiable in its parameters.
+def computed_gain(design: Design, plant: CartPole) -> Float[Array, "1 4"]:
+    """Returns the gain that the paper's poles or weights give on `plant`; differentiable in its parameters.
 
     Raises:
       InputError: `design` is not one of the two, or the plant has no such gain.
@@ -162,8 +162,8 @@ def _state_weight() -> list[list[float]]:
     return np.diag(Q).tolist()
 
 
-def riccati_solution(plant: CartPole) -> jax.Array:
-    """Returns P (4, 4) of the paper's linear quadratic regulator on `plant` (section IV-B, "State Dependent" there).
+def riccati_solution(plant: CartPole) -> Float[Array, "4 4"]:
+    """Returns P of the paper's linear quadratic regulator on `plant` (section IV-B, "State Dependent" there).
 
     Raises:
       InputError: the plant has no such regulator.

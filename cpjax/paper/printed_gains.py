@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from cpjax import paper
 from cpjax.errors import InputError
@@ -81,8 +82,8 @@ class PrintedGain:
         """Design that the gain is from: "placement" or "lqr"."""
         return "placement" if self.poles is not None else "lqr"
 
-    def computed(self, plant: CartPole) -> jax.Array:
-        """Returns the gain (4,) that the poles or weights give on `plant`."""
+    def computed(self, plant: CartPole) -> Float[Array, "4"]:
+        """Returns the gain that the poles or weights give on `plant`."""
         A, B = linearize(plant)
         if self.poles is not None:
             return place_polynomial(A, B, polynomial_from_poles(self.poles).astype(A.dtype))[0]
