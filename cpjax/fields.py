@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeAlias, TypeVar, dataclass_transform
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from cpjax.errors import InputError
 
@@ -22,11 +23,14 @@ T = TypeVar("T")
 RULE = "cpjax"
 """Key of a field's declaration in the metadata of dataclasses."""
 
-Array: TypeAlias = jax.Array | np.ndarray[Any, Any]
+JaxOrNumpy: TypeAlias = Array | np.ndarray
 """An array that JAX accepts. Classes hold NumPy arrays until a rollout casts them: no JAX backend starts before."""
 
-Scalar: TypeAlias = Array | float
+Scalar: TypeAlias = Float[JaxOrNumpy, ""] | float
 """One real number: a Python float, or an array of shape () that JAX may trace. Batches appear only under `vmap`."""
+
+Scalars: TypeAlias = Float[JaxOrNumpy, "*batch"] | float
+"""A real number, or a batch of them."""
 
 Size: TypeAlias = float | Callable[[Any], Any]
 """A size in the parameter's unit: a number, or a function of the component; for a motor's parameter, of the plant."""

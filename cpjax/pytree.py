@@ -17,10 +17,11 @@ import numpy as np
 from cpjax.errors import InputError
 from cpjax.fields import (
     RULE,
-    Array,
+    JaxOrNumpy,
     Matrix,
     Number,
     Scalar,
+    Scalars,
     fits,
     is_traced,
     matrix,
@@ -32,10 +33,11 @@ from cpjax.fields import (
 )
 
 __all__ = [
-    "Array",
+    "JaxOrNumpy",
     "Matrix",
     "Number",
     "Scalar",
+    "Scalars",
     "as_arguments",
     "as_array",
     "cast",
@@ -91,7 +93,7 @@ def pytree(cls: type[T]) -> type[T]:
     jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
     fields = dataclasses.fields(made)
     _COMPONENTS[made] = tuple(
-        f.name for f in fields if RULE not in f.metadata and f.type in (Scalar, float, "Scalar", "float")
+        f.name for f in fields if RULE not in f.metadata and f.type in (Scalar, Scalars, float, "Scalar", "float")
     )
     return made
 
@@ -266,7 +268,7 @@ def _cast(leaf: Any, dtype: Any) -> Any:
     return as_array(leaf, dtype) if real else leaf
 
 
-def as_array(value: Any, dtype: Any) -> Array:
+def as_array(value: Any, dtype: Any) -> JaxOrNumpy:
     """Converts like `jnp.asarray`, but leaves values from outside JAX in NumPy and returns matching arrays unchanged.
 
     A rollout is called with dozens of numbers, and this takes a tenth of the time.

@@ -16,7 +16,7 @@ from cpjax.backend.extremes import fast_maximum
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
-from cpjax.pytree import Scalar, number, part, pytree
+from cpjax.pytree import Scalar, Scalars, number, part, pytree
 
 
 @pytree
@@ -34,11 +34,11 @@ class EnergySwingUp:
     """
 
     model: CartPole = part("plant model used by the law, a CartPole", "force_for_acceleration", "motor")
-    energy_gain: Scalar = number("m/(J s)", "k, cart acceleration per E theta' cos(theta)", at_least=0.0)
-    cart_stiffness: Scalar = number("1/s^2", "pull of the cart to x = 0", default=0.0, at_least=0.0)
-    cart_damping: Scalar = number("1/s", "damping of the cart", default=0.0, at_least=0.0)
-    kick: Scalar = number("m/s^2", "acceleration hanging at rest; 0 for none", default=0.5)
-    kick_radius: Scalar = number(
+    energy_gain: Scalars = number("m/(J s)", "k, cart acceleration per E theta' cos(theta)", at_least=0.0)
+    cart_stiffness: Scalars = number("1/s^2", "pull of the cart to x = 0", default=0.0, at_least=0.0)
+    cart_damping: Scalars = number("1/s", "damping of the cart", default=0.0, at_least=0.0)
+    kick: Scalars = number("m/s^2", "acceleration hanging at rest; 0 for none", default=0.5)
+    kick_radius: Scalars = number(
         "rad", "swing amplitude beyond which the kick is gone", default=0.02, at_least=1e-3, at_most=math.pi / 2
     )
 

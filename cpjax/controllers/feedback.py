@@ -7,22 +7,24 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeAlias, runtime_checka
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Complex, Float, Num
 
 from cpjax.errors import InputError
 from cpjax.linear.lqr import lqr
 from cpjax.linear.lyapunov import lyapunov
 from cpjax.linear.placement import QuadraticFactors, place_polynomial
 from cpjax.plant.state import NAMES, UPRIGHT, State, checked_reference, deviation
-from cpjax.pytree import Array, Scalar, is_traced, matrix, number, part, pytree
+from cpjax.pytree import JaxOrNumpy, Scalar, Scalars, is_traced, matrix, number, part, pytree
 
 
 class Designed(NamedTuple):
     """Result of a design for a linear model."""
 
-    K: jax.Array
-    """Gain (1, 4) of u = -K s."""
-    P: jax.Array
-    """Shape (4, 4): s' P s falls along the linear closed loop."""
+    K: Float[Array, "1 4"]
+    """Gain of u = -K s."""
+    P: Float[Array, "4 4"]
+    """s' P s falls along the linear closed loop."""
 
 
 DesignName: TypeAlias = Literal["placement", "lqr"]
@@ -33,8 +35,8 @@ DesignName: TypeAlias = Literal["placement", "lqr"]
 class Design(Protocol):
     """Interface of a design method, which computes a gain from a linear model."""
 
-    def solve(self, A: Array, B: Array) -> Designed:
-        """Returns gain and P for the linear model A (4, 4), B (4, 1). Differentiable."""
+    def solve(self, A: Float[JaxOrNumpy, "4 4"], B: Float[JaxOrNumpy, "4 1"]) -> Designed:
+        """Returns gain and P for the linear model with state matrix A and input matrix B. Differentiable."""
         ...
 
 
@@ -42,11 +44,13 @@ class Design(Protocol):
 class LqrWeights:
     """Weights of a linear quadratic regulator."""
 
-    Q: Array = matrix((4, 4), "per product of states", "state weight, positive semidefinite", symmetric=True)
-    R: Scalar = number("1/V^2", "weight of the voltage", above=0.0)
+    Q: Float[JaxOrNumpy, "*batch 4 4"] = matrix(
+        (4, 4), "per product of states", "state weight, positive semidefinite", symmetric=True
+    )
+    R: Scalars = number("1/V^2", "weight of the voltage", above=0.0)
 
-    def solve(self, A: Array, B: Array) -> Designed:
-        """Solves the algebraic Riccati equation for A (4, 4), B (4, 1); P is its solution."""
+    def solve(self, A: Float[JaxOrNumpy, "4 4"], B: Float[JaxOrNumpy, "4 1"]) -> Designed:
+        """Solves the algebraic Riccati equation; P is its solution."""
         return Designed(*lqr(A, B, self.Q, jnp.reshape(jnp.asarray(self.R), (1, 1))))
 
 
@@ -54,8 +58,8 @@ class LqrWeights:
 class PoleFactors:
     """Poles of a placement, as factors s^2 + a s + b of the characteristic polynomial; see `QuadraticFactors`."""
 
-    a: Array = matrix((2,), "1/s", "above 0: twice the mean rate of decay of each pair")
-    b: Array = matrix((2,), "1/s^2", "above 0: product of each pair")
+    a: Float[JaxOrNumpy, "*batch 2"] = matrix((2,), "1/s", "above 0: twice the mean rate of decay of each pair")
+    b: Float[JaxOrNumpy, "*batch 2"] = matrix((2,), "1/s^2", "above 0: product of each pair")
 
     def __post_init__(self) -> None:
         for name in ("a", "b"):
@@ -64,7 +68,7 @@ class PoleFactors:
                 raise InputError(f"PoleFactors.{name}", value, "two numbers above 0: the poles are to be stable")
 
     @classmethod
-    def from_poles(cls, poles: Array | Sequence[complex]) -> "PoleFactors":
+    def from_poles(cls, poles: Num[ArrayLike, "4"] | Sequence[complex]) -> "PoleFactors":
         """Builds the factors from four concrete poles [1/s]; see `QuadraticFactors.from_poles`.
 
         Raises:
@@ -76,16 +80,16 @@ class PoleFactors:
         return cls(np.asarray(factors.a), np.asarray(factors.b))
 
     @property
-    def poles(self) -> jax.Array:
-        """Returns the four poles, shape (4,), complex [1/s]; not differentiable where two of them coincide."""
+    def poles(self) -> Complex[Array, "4"]:
+        """Returns the poles [1/s]; not differentiable where two of them coincide."""
         return self._factors().poles()
 
     @property
-    def polynomial(self) -> jax.Array:
-        """Returns the characteristic polynomial (4,) in the form that `place_polynomial` takes."""
+    def polynomial(self) -> Float[Array, "4"]:
+        """Returns the characteristic polynomial in the form that `place_polynomial` takes."""
         return self._factors().polynomial()
 
-    def solve(self, A: Array, B: Array) -> Designed:
+    def solve(self, A: Float[JaxOrNumpy, "4 4"], B: Float[JaxOrNumpy, "4 1"]) -> Designed:
         """Places the poles by Ackermann's formula; P solves the closed loop's Lyapunov equation with right side -I."""
         K = place_polynomial(A, B, self.polynomial)
         A, B = jnp.asarray(A), jnp.asarray(B)
@@ -104,7 +108,7 @@ class StateFeedback:
     the law depends on K alone.
     """
 
-    K: Array = matrix((1, 4), "V per unit of state", "gain, u = -K (s - s_ref)")
+    K: Float[JaxOrNumpy, "*batch 1 4"] = matrix((1, 4), "V per unit of state", "gain, u = -K (s - s_ref)")
     reference: State = part("the state to hold, a State", *NAMES, default=UPRIGHT)
     design: Design | None = None
 

@@ -10,21 +10,21 @@ below zero for any useful level.
 import math
 from typing import Any, Protocol
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int32
 
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.controllers.protocol import REGULATE
 from cpjax.errors import InputError
 from cpjax.plant.state import NAMES, UPRIGHT, State, checked_reference, deviation
-from cpjax.pytree import Array, Scalar, is_traced, matrix, number, part, pytree
+from cpjax.pytree import JaxOrNumpy, Scalar, Scalars, is_traced, matrix, number, part, pytree
 
 
 class Gate(Protocol):
     """Interface of a gate, as `Hybrid` uses it."""
 
-    def margin(self, state: State, mode: jax.Array) -> Scalar:
+    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
         """Returns the margin, smooth in the state: at least 0 where the regulator acts, given the mode until now."""
         ...
 
@@ -33,13 +33,13 @@ class Gate(Protocol):
 class AngleGate:
     """Gate within `half_angle` of upright: margin = cos(theta) - cos(size)."""
 
-    half_angle: Scalar = number("rad", "angle from upright", above=0.0, at_most=math.pi)
-    hysteresis: Scalar = number("1", "relative enlargement of the exit region", default=0.0, at_least=0.0, typical=0.1)
+    half_angle: Scalars = number("rad", "angle from upright", above=0.0, at_most=math.pi)
+    hysteresis: Scalars = number("1", "relative enlargement of the exit region", default=0.0, at_least=0.0, typical=0.1)
 
     def __post_init__(self) -> None:
         _check_widened_angle("AngleGate", self.half_angle, self.hysteresis)
 
-    def margin(self, state: State, mode: jax.Array) -> Scalar:
+    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
         """Returns the margin [1]; its boundary depends on the mode (int32) if there is hysteresis."""
         _, cos = sin_cos(state.theta)
         # Both edges, then one of them is selected: they do not depend on the state, so a batch computes them once.
@@ -54,14 +54,14 @@ class AngleRateGate:
     The region extends to `half_angle` at rest and to `rate` upright.
     """
 
-    half_angle: Scalar = number("rad", "angle from upright, at rest", above=0.0, at_most=math.pi)
-    rate: Scalar = number("rad/s", "angular rate, upright", above=0.0)
-    hysteresis: Scalar = number("1", "relative enlargement of the exit region", default=0.0, at_least=0.0, typical=0.1)
+    half_angle: Scalars = number("rad", "angle from upright, at rest", above=0.0, at_most=math.pi)
+    rate: Scalars = number("rad/s", "angular rate, upright", above=0.0)
+    hysteresis: Scalars = number("1", "relative enlargement of the exit region", default=0.0, at_least=0.0, typical=0.1)
 
     def __post_init__(self) -> None:
         _check_widened_angle("AngleRateGate", self.half_angle, self.hysteresis)
 
-    def margin(self, state: State, mode: jax.Array) -> Scalar:
+    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
         """Returns the margin [1]; its boundary depends on the mode (int32) if there is hysteresis."""
         _, cos = sin_cos(state.theta)
         # Both regions, then one of them is selected: they do not depend on the state, so a batch computes them once.
@@ -81,15 +81,17 @@ class AngleRateGate:
 class LyapunovGate:
     """Gate in a level set of s' P s, with s the deviation from `reference`: margin = 1 - s' P s / level."""
 
-    P: Array = matrix((4, 4), "per product of states", "symmetric weight, such as LQR's P", symmetric=True)
-    level: Scalar = number("1", "s' P s up to which the gate is open", above=0.0)
-    hysteresis: Scalar = number("1", "relative enlargement of the exit region", default=0.0, at_least=0.0, typical=0.1)
+    P: Float[JaxOrNumpy, "*batch 4 4"] = matrix(
+        (4, 4), "per product of states", "symmetric weight, such as LQR's P", symmetric=True
+    )
+    level: Scalars = number("1", "s' P s up to which the gate is open", above=0.0)
+    hysteresis: Scalars = number("1", "relative enlargement of the exit region", default=0.0, at_least=0.0, typical=0.1)
     reference: State = part("the middle of the level set, a State", *NAMES, default=UPRIGHT)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "reference", checked_reference("LyapunovGate.reference", self.reference))
 
-    def margin(self, state: State, mode: jax.Array) -> Scalar:
+    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
         """Returns the margin [1]; its boundary depends on the mode (int32) if there is hysteresis."""
         s = deviation(state, self.reference)
         # Written as a sum, not as a matrix product, so that under vmap each component stays an array of its own.

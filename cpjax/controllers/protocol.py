@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int32
 
 from cpjax.checks import call, integer, real
 from cpjax.errors import InputError
@@ -59,15 +60,15 @@ class Controller(Protocol):
 class ModalController(Protocol):
     """A law for each mode, and the rule that chooses the mode. Modes are int32 scalars."""
 
-    def start_mode(self, state: State) -> jax.Array:
+    def start_mode(self, state: State) -> Int32[Array, ""]:
         """Returns the mode at the start of a rollout, where there is no earlier mode."""
         ...
 
-    def next_mode(self, state: State, mode: jax.Array) -> jax.Array:
+    def next_mode(self, state: State, mode: Int32[Array, ""]) -> Int32[Array, ""]:
         """Returns the mode from this control instant on, given the mode until now."""
         ...
 
-    def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
+    def mode_voltage(self, state: State, mode: Int32[Array, ""]) -> Scalar:
         """Returns the demanded terminal voltage [V] of the law that acts in `mode`; the motor clips it."""
         ...
 
@@ -76,11 +77,11 @@ class ModalController(Protocol):
 class SmoothController(ModalController, Protocol):
     """A controller whose mode ends where a smooth function vanishes, so that the instant can be located."""
 
-    def margin(self, state: State, mode: jax.Array) -> Scalar:
+    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
         """Returns a scalar that is at least 0 while `mode` lasts, smooth in the state near 0."""
         ...
 
-    def successor(self, mode: jax.Array) -> jax.Array:
+    def successor(self, mode: Int32[Array, ""]) -> Int32[Array, ""]:
         """Returns the mode after `mode`, once its margin has vanished."""
         ...
 
@@ -101,15 +102,15 @@ class ModeMemory(NamedTuple):
     """Memory of a controller with modes. The loop finds it inside any controller's memory and records the mode.
 
     Attributes:
-      mode: int32, since the last update.
+      mode: since the last update.
       margin: of that mode at the last update; only if the derivative of the mean is requested, else None.
       shift: of the last change of mode, as a fraction of the control period: value 0, with the derivative of the
         instant of crossing; only if the derivative of the mean is requested, else None.
     """
 
-    mode: jax.Array
-    margin: jax.Array | None = None
-    shift: jax.Array | None = None
+    mode: Int32[Array, ""]
+    margin: Float[Array, ""] | None = None
+    shift: Float[Array, ""] | None = None
 
 
 def modes_in(memory: Any) -> list[ModeMemory]:
@@ -129,7 +130,7 @@ def start_memory(controller: ModalController, state: State) -> ModeMemory:
     return ModeMemory(integer("controller.start_mode", call("controller", controller, "start_mode", state)))
 
 
-def demand(controller: ModalController, state: State, mode: jax.Array) -> jax.Array:
+def demand(controller: ModalController, state: State, mode: Int32[Array, ""]) -> Float[Array, ""]:
     """Returns the voltage [V] that the law of `mode` demands, in the state's dtype."""
     dtype = jnp.asarray(jax.tree.leaves(state)[0]).dtype
     return real("controller.mode_voltage", call("controller", controller, "mode_voltage", state, mode), dtype)
@@ -147,19 +148,19 @@ class SingleLaw:
     def update(self, memory: tuple[()], measurement: State) -> tuple[tuple[()], Scalar]:
         return (), self._voltage(measurement)
 
-    def start_mode(self, state: State) -> jax.Array:
+    def start_mode(self, state: State) -> Int32[Array, ""]:
         return jnp.asarray(SWING_UP, dtype=jnp.int32)
 
-    def next_mode(self, state: State, mode: jax.Array) -> jax.Array:
+    def next_mode(self, state: State, mode: Int32[Array, ""]) -> Int32[Array, ""]:
         return mode
 
-    def mode_voltage(self, state: State, mode: jax.Array) -> Scalar:
+    def mode_voltage(self, state: State, mode: Int32[Array, ""]) -> Scalar:
         return self._voltage(state)
 
-    def margin(self, state: State, mode: jax.Array) -> Scalar:
+    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
         return 1.0
 
-    def successor(self, mode: jax.Array) -> jax.Array:
+    def successor(self, mode: Int32[Array, ""]) -> Int32[Array, ""]:
         return mode
 
     def _voltage(self, state: State) -> jax.Array:

@@ -7,18 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float, Int32
 
 from cpjax.errors import InputError
-from cpjax.pytree import Array, Scalar, is_traced, matrix, pytree
+from cpjax.pytree import JaxOrNumpy, Scalar, is_traced, matrix, pytree
 
 
 class SignalMemory(NamedTuple):
     """Playback position in a signal."""
 
-    samples: jax.Array
-    """Number of control instants so far, int32: unlike a sum of periods, free of rounding errors."""
-    next: jax.Array
-    """Index of the next time of the signal, int32."""
+    samples: Int32[Array, ""]
+    """Number of control instants so far: unlike a sum of periods, free of rounding errors."""
+    next: Int32[Array, ""]
+    """Index of the next time of the signal."""
 
 
 @pytree
@@ -33,8 +34,8 @@ class VoltageSignal:
     Differentiable in the voltages, not in the times: a command changes at a control instant.
     """
 
-    times: Array = matrix((None,), "s", "rising: from when on each voltage is commanded")
-    voltages: Array = matrix((None,), "V", "one for each time")
+    times: Float[JaxOrNumpy, "*batch times"] = matrix((None,), "s", "rising: from when on each voltage is commanded")
+    voltages: Float[JaxOrNumpy, "*batch times"] = matrix((None,), "V", "one for each time")
     period: Scalar | None = None
     """Control period of the loop [s], set by the rollout."""
 

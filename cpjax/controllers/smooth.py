@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from cpjax.controllers.gates import Gate
 from cpjax.controllers.protocol import SWING_UP, Law
 from cpjax.plant.state import State
-from cpjax.pytree import Scalar, number, part, pytree
+from cpjax.pytree import Scalar, Scalars, number, part, pytree
 
 
 @pytree
@@ -25,7 +25,7 @@ class SmoothHybrid:
     swing_up: Law = part("a law", "voltage")
     regulator: Law = part("a law", "voltage")
     gate: Gate = part("a gate", "margin")
-    temperature: Scalar = number("1", "margin over which the share rises from 1/2 to 3/4, almost", above=0.0)
+    temperature: Scalars = number("1", "margin over which the share rises from 1/2 to 3/4, almost", above=0.0)
 
     def voltage(self, state: State) -> Scalar:
         """Returns the demanded voltage [V]."""
@@ -44,8 +44,8 @@ class SmoothClip:
     """
 
     law: Law = part("a law", "voltage")
-    voltage_limit: Scalar = number("V", "supply, as of the motor", above=0.0)
-    temperature: Scalar = number("V", "over which the demand bends", above=0.0)
+    voltage_limit: Scalars = number("V", "supply, as of the motor", above=0.0)
+    temperature: Scalars = number("V", "over which the demand bends", above=0.0)
 
     def voltage(self, state: State) -> Scalar:
         """Returns the demanded voltage [V]."""

@@ -1,20 +1,25 @@
 """Argument conversion and checks shared by the design functions: one floating dtype, compatible shapes."""
 
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Real
 
 from cpjax.errors import InputError
-from cpjax.pytree import Array, is_traced
+from cpjax.pytree import is_traced
 
-MatrixLike: TypeAlias = Array | Sequence[Sequence[float]] | Sequence[float] | float
-"""A matrix as an array or a nested list; for one input also as a plain list, or as a number for 1 x 1."""
+if TYPE_CHECKING:
+    MatrixLike: TypeAlias = ArrayLike | Sequence[Sequence[float]] | Sequence[float]
+else:
+    MatrixLike = ArrayLike  # a list has no shape that a type could state
+"""An array, a nested list or a number; with its axes in a signature, as in `Real[MatrixLike, "n n"]`."""
 
 
-def matrices(**given: Any) -> list[jax.Array]:
+def matrices(**given: Real[MatrixLike, "..."]) -> list[Float[Array, "..."]]:
     """Converts the given arrays, nested lists or numbers to JAX arrays of one floating dtype, in order.
 
     The dtype is the widest among the floating-point arrays; lists and whole numbers take it, or JAX's default if there
@@ -25,6 +30,7 @@ def matrices(**given: Any) -> list[jax.Array]:
     """
     allowed = "an array of finite real numbers"
     arrays, dtypes = {}, []
+    value: Any
     for name, value in given.items():
         array: Any
         if any(is_traced(leaf) for leaf in jax.tree.leaves(value)):
@@ -54,8 +60,8 @@ def matrices(**given: Any) -> list[jax.Array]:
     return list(converted.values())
 
 
-def square(name: str, matrix: jax.Array) -> int:
-    """Returns the size n of a square matrix (n, n).
+def square(name: str, matrix: Float[Array, "..."]) -> int:
+    """Returns the size n of a square matrix.
 
     Raises:
       InputError: the matrix is not square, or is empty.
@@ -66,7 +72,7 @@ def square(name: str, matrix: jax.Array) -> int:
     return matrix.shape[0]
 
 
-def shaped(name: str, matrix: jax.Array, shape: tuple[int, ...]) -> None:
+def shaped(name: str, matrix: Float[Array, "..."], shape: tuple[int, ...]) -> None:
     """Refuses a matrix of another shape.
 
     Raises:
@@ -76,8 +82,8 @@ def shaped(name: str, matrix: jax.Array, shape: tuple[int, ...]) -> None:
         raise InputError(name, f"array of shape {matrix.shape}", f"of shape {shape}; batches go through jax.vmap")
 
 
-def columns(name: str, matrix: jax.Array, n: int) -> jax.Array:
-    """Returns the input matrix as (n, m), m at least 1; a plain vector (n,) is taken as that of one input.
+def columns(name: str, matrix: Float[Array, "..."], n: int) -> Float[Array, "{n} m"]:
+    """Returns the input matrix, m at least 1; a plain vector (n,) is taken as that of one input.
 
     Raises:
       InputError: another shape.
@@ -89,8 +95,8 @@ def columns(name: str, matrix: jax.Array, n: int) -> jax.Array:
     return matrix
 
 
-def rows(name: str, matrix: jax.Array, n: int) -> jax.Array:
-    """Returns the output matrix, or a gain, as (p, n), p at least 1; a plain vector (n,) is taken as one row.
+def rows(name: str, matrix: Float[Array, "..."], n: int) -> Float[Array, "p {n}"]:
+    """Returns the output matrix, or a gain, p at least 1; a plain vector (n,) is taken as one row.
 
     Raises:
       InputError: another shape.
@@ -102,8 +108,8 @@ def rows(name: str, matrix: jax.Array, n: int) -> jax.Array:
     return matrix
 
 
-def gain_matrix(name: str, matrix: jax.Array, m: int, n: int) -> jax.Array:
-    """Returns the gain of m inputs as (m, n); a plain vector (n,) is taken as that of one input.
+def gain_matrix(name: str, matrix: Float[Array, "..."], m: int, n: int) -> Float[Array, "{m} {n}"]:
+    """Returns the gain of m inputs; a plain vector (n,) is taken as that of one input.
 
     Raises:
       InputError: another shape.
@@ -113,8 +119,8 @@ def gain_matrix(name: str, matrix: jax.Array, m: int, n: int) -> jax.Array:
     return matrix
 
 
-def input_weight(name: str, matrix: jax.Array, m: int) -> jax.Array:
-    """Returns the weight of m inputs as (m, m); a number is taken as that of one input.
+def input_weight(name: str, matrix: Float[Array, "..."], m: int) -> Float[Array, "{m} {m}"]:
+    """Returns the weight of m inputs; a number is taken as that of one input.
 
     Raises:
       InputError: another shape.
@@ -124,8 +130,8 @@ def input_weight(name: str, matrix: jax.Array, m: int) -> jax.Array:
     return matrix
 
 
-def column(name: str, matrix: jax.Array, n: int) -> jax.Array:
-    """Returns the input matrix of a single input as (n, 1); a plain vector (n,) is accepted.
+def column(name: str, matrix: Float[Array, "..."], n: int) -> Float[Array, "{n} 1"]:
+    """Returns the input matrix of a single input; a plain vector (n,) is accepted.
 
     Raises:
       InputError: another shape.

@@ -22,9 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.linalg import expm
+from jaxtyping import Array, Float, Real
 
 from cpjax.errors import InputError
-from cpjax.linear.arguments import columns, input_weight, matrices, shaped, square
+from cpjax.linear.arguments import MatrixLike, columns, input_weight, matrices, shaped, square
 from cpjax.numeric.small_matrices import product, symmetric, transpose
 from cpjax.pytree import Scalar, is_traced
 
@@ -36,33 +37,35 @@ T = TypeVar("T")
 class SampledModel(NamedTuple):
     """Discrete-time model s[k + 1] = A s[k] + B u[k], with u held in between."""
 
-    A: jax.Array
-    """Shape (n, n)."""
-    B: jax.Array
-    """Shape (n, m)."""
+    A: Float[Array, "n n"]
+    B: Float[Array, "n m"]
 
 
 class SampledCost(NamedTuple):
     """Cost of one period, s[k]' Q s[k] + 2 s[k]' N u[k] + u[k]' R u[k], in state and input at its beginning."""
 
-    Q: jax.Array
-    """Shape (n, n), symmetric."""
-    R: jax.Array
-    """Shape (m, m), symmetric."""
-    N: jax.Array
-    """Shape (n, m)."""
+    Q: Float[Array, "n n"]
+    """Symmetric."""
+    R: Float[Array, "m m"]
+    """Symmetric."""
+    N: Float[Array, "n m"]
 
 
-def discretize(A: Any, B: Any, period: Scalar) -> SampledModel:
+def discretize(
+    A: Real[MatrixLike, "n n"], B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"], period: Scalar
+) -> SampledModel:
     """Discretises the model s' = A s + B u exactly, with the input held between control instants (zero-order hold).
 
     Errors are at most 8 units of rounding of a matrix's largest entry, times |A| period where that is above 1 (|A| the
     1-norm; `tests/linear/test_discretization.py`). Differentiable in all arguments, under `jit` and `vmap` too.
 
     Args:
-      A: (n, n) [1/s].
-      B: (n, m), or (n,) for one input.
+      A: state matrix [1/s].
+      B: input matrix; a vector for one input.
       period: above 0 [s].
+
+    Returns:
+      The discrete-time model.
 
     Raises:
       InputError: shapes that do not fit, numbers that are not finite and real, a period that is not above 0, or one so
@@ -73,18 +76,27 @@ def discretize(A: Any, B: Any, period: Scalar) -> SampledModel:
     return _finite(period, _model(A, B, period))
 
 
-def discretize_cost(A: Any, B: Any, Q: Any, R: Any, period: Scalar) -> SampledCost:
+def discretize_cost(
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"],
+    Q: Real[MatrixLike, "n n"],
+    R: Real[MatrixLike, "m m"] | Scalar,
+    period: Scalar,
+) -> SampledCost:
     """Integrates s' Q s + u' R u over a period in which u is held, as a quadratic form in s and u at its beginning.
 
     A discrete-time regulator with this cost and the model of `discretize` minimises the continuous integral. As
     accurate and differentiable as `discretize`; only the symmetric parts of Q and R count.
 
     Args:
-      A: (n, n) [1/s].
-      B: (n, m), or (n,) for one input.
-      Q: (n, n), weight of the state.
-      R: (m, m), weight of the input, or a number for one input.
+      A: state matrix [1/s].
+      B: input matrix; a vector for one input.
+      Q: weight of the state.
+      R: weight of the input; a number for one input.
       period: above 0 [s].
+
+    Returns:
+      The weights of the discrete-time cost.
 
     Raises:
       InputError: as for `discretize`.

@@ -13,23 +13,26 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float, Real
 
 from cpjax.errors import InputError
 from cpjax.linear.arguments import MatrixLike, columns, gain_matrix, matrices, shaped, square
 from cpjax.linear.lyapunov import lyapunov
 from cpjax.numeric.small_matrices import is_positive_definite, linear_solve
-from cpjax.pytree import Number, Scalar, is_traced
+from cpjax.pytree import JaxOrNumpy, Number, Scalar, is_traced
 
 _THETA = 2  # index of the angle in the state
 _RATE = 3
 
 
-def demanded_voltage(K: MatrixLike, angle: Scalar) -> jax.Array:
+def demanded_voltage(
+    K: Real[MatrixLike, "1 4"] | Real[MatrixLike, "4"], angle: Real[JaxOrNumpy, "*angles"] | float
+) -> Float[Array, "*angles"]:
     """Returns |u| [V] that a gain demands with the pole at `angle` from upright and all other states 0.
 
     Args:
-      K: (1, 4) or (4,) [V per unit of state].
-      angle: from upright, any shape [rad].
+      K: gain [V per unit of state].
+      angle: from upright [rad].
 
     Raises:
       InputError: K has another shape or is not finite.
@@ -39,13 +42,13 @@ def demanded_voltage(K: MatrixLike, angle: Scalar) -> jax.Array:
     return jnp.abs(K[0, _THETA] * jnp.asarray(angle, dtype=K.dtype))
 
 
-def saturation_angle(K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
+def saturation_angle(K: Real[MatrixLike, "1 4"] | Real[MatrixLike, "4"], voltage_limit: Scalar) -> Float[Array, ""]:
     """Returns the angle [rad] from upright beyond which a gain demands more than the limit, all other states being 0.
 
     Infinite for a gain that ignores the angle.
 
     Args:
-      K: (1, 4) or (4,) [V per unit of state].
+      K: gain [V per unit of state].
       voltage_limit: above 0, may be infinite [V].
 
     Raises:
@@ -56,14 +59,19 @@ def saturation_angle(K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
     return _limit("voltage_limit", "V", voltage_limit, K, infinite=True) / jnp.abs(K[0, _THETA])
 
 
-def lyapunov_function(A: MatrixLike, B: MatrixLike, K: MatrixLike, Q: MatrixLike) -> jax.Array:
-    """Returns P (n, n) for which d/dt s' P s = -s' Q s under s' = (A - B K) s.
+def lyapunov_function(
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"],
+    K: Real[MatrixLike, "m n"] | Real[MatrixLike, " n"],
+    Q: Real[MatrixLike, "n n"],
+) -> Float[Array, "n n"]:
+    """Returns P for which d/dt s' P s = -s' Q s under s' = (A - B K) s.
 
     Args:
-      A: (n, n).
-      B: (n, m), or (n,) for one input.
-      K: (m, n), or (n,) for one input.
-      Q: (n, n).
+      A: state matrix.
+      B: input matrix; a vector for one input.
+      K: gain; a vector for one input.
+      Q: rate at which s' P s falls, as a quadratic form.
 
     Raises:
       InputError: shapes that do not fit, or a concrete closed loop that is not stable. Under jit P is NaN instead.
@@ -75,12 +83,14 @@ def lyapunov_function(A: MatrixLike, B: MatrixLike, K: MatrixLike, Q: MatrixLike
     return lyapunov(A - B @ K, Q)
 
 
-def level_within_voltage(P: MatrixLike, K: MatrixLike, voltage_limit: Scalar) -> jax.Array:
+def level_within_voltage(
+    P: Real[MatrixLike, "n n"], K: Real[MatrixLike, "1 n"] | Real[MatrixLike, " n"], voltage_limit: Scalar
+) -> Float[Array, ""]:
     """Returns the largest level for which |K s| stays within `voltage_limit` wherever s' P s is at most that level.
 
     Args:
-      P: (n, n), symmetric, positive definite.
-      K: (1, n) or (n,) [V per unit of state].
+      P: symmetric, positive definite.
+      K: gain [V per unit of state].
       voltage_limit: above 0, may be infinite [V].
 
     Raises:
@@ -93,11 +103,11 @@ def level_within_voltage(P: MatrixLike, K: MatrixLike, voltage_limit: Scalar) ->
     return limit * limit / (K @ linear_solve(P, K.T))[0, 0]
 
 
-def level_within_angle(P: MatrixLike, half_angle: Scalar) -> jax.Array:
+def level_within_angle(P: Real[MatrixLike, "4 4"], half_angle: Scalar) -> Float[Array, ""]:
     """Returns the largest level for which |theta| stays within `half_angle`, the region of an AngleGate.
 
     Args:
-      P: (4, 4), symmetric, positive definite.
+      P: symmetric, positive definite.
       half_angle: above 0, at most pi [rad].
 
     Raises:
@@ -109,13 +119,13 @@ def level_within_angle(P: MatrixLike, half_angle: Scalar) -> jax.Array:
     return edge * edge / _spread(P, (_THETA,))[0, 0]
 
 
-def level_within_angle_and_rate(P: MatrixLike, half_angle: Scalar, rate: Scalar) -> jax.Array:
+def level_within_angle_and_rate(P: Real[MatrixLike, "4 4"], half_angle: Scalar, rate: Scalar) -> Float[Array, ""]:
     """Returns the largest level inside an AngleRateGate.
 
     The gate is (1 - cos theta) / (1 - cos half_angle) + (theta' / rate)^2 <= 1.
 
     Args:
-      P: (4, 4), symmetric, positive definite.
+      P: symmetric, positive definite.
       half_angle: above 0, at most pi [rad].
       rate: above 0 [rad/s].
 
@@ -165,14 +175,14 @@ def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -
     return level(position - jnp.where(bend > 0.0, step, 0.0), *gate)
 
 
-def level_within_form(P: MatrixLike, other: MatrixLike, level: Scalar) -> jax.Array:
+def level_within_form(P: Real[MatrixLike, "n n"], other: Real[MatrixLike, "n n"], level: Scalar) -> Float[Array, ""]:
     """Returns the largest level of P for which s' `other` s stays within `level`, as in another P's LyapunovGate.
 
     Infinite where s' `other` s is nowhere positive.
 
     Args:
-      P: (n, n), symmetric, positive definite.
-      other: (n, n), symmetric.
+      P: symmetric, positive definite.
+      other: symmetric.
       level: above 0 [1].
 
     Raises:

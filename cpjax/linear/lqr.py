@@ -2,22 +2,27 @@
 
 from typing import NamedTuple
 
-import jax
+from jaxtyping import Array, Float, Real
 
 from cpjax.linear.arguments import MatrixLike
 from cpjax.linear.riccati import solve_care, solve_dare
+from cpjax.pytree import Scalar
 
 
 class LinearQuadratic(NamedTuple):
     """Gain of u = -K s, and Riccati solution: s' P s is the least cost of bringing s to rest."""
 
-    K: jax.Array
-    """Shape (m, n)."""
-    P: jax.Array
-    """Shape (n, n)."""
+    K: Float[Array, "m n"]
+    P: Float[Array, "n n"]
 
 
-def lqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> LinearQuadratic:
+def lqr(
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"],
+    Q: Real[MatrixLike, "n n"],
+    R: Real[MatrixLike, "m m"] | Scalar,
+    N: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"] | None = None,
+) -> LinearQuadratic:
     """Returns the gain that stabilises s' = A s + B u and minimises the integral of s' Q s + 2 s' N u + u' R u.
 
     (A, B) must be stabilisable, and every mode of A on the imaginary axis observable through Q. A mode elsewhere needs
@@ -26,11 +31,14 @@ def lqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLik
     K depends on the ratio of the weights alone: (c Q, c R, c N) gives the same K for any c > 0, and c P.
 
     Args:
-      A: (n, n).
-      B: (n, m), or (n,) for one input.
-      Q: (n, n), symmetric, positive semidefinite.
-      R: (m, m), symmetric, positive definite; or a number for one input.
-      N: (n, m); zero if left out.
+      A: state matrix.
+      B: input matrix; a vector for one input.
+      Q: symmetric, positive semidefinite.
+      R: symmetric, positive definite; a number for one input.
+      N: zero if left out; a vector for one input.
+
+    Returns:
+      Gain and Riccati solution.
 
     Raises:
       InputError: see `cpjax.linear.riccati.solve_care`. Under jit K and P are NaN instead.
@@ -39,10 +47,16 @@ def lqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLik
     return LinearQuadratic(K, P)
 
 
-def dlqr(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> LinearQuadratic:
+def dlqr(
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"],
+    Q: Real[MatrixLike, "n n"],
+    R: Real[MatrixLike, "m m"] | Scalar,
+    N: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"] | None = None,
+) -> LinearQuadratic:
     """Returns the gain that stabilises s[k+1] = A s[k] + B u[k] and minimises the sum of s' Q s + 2 s' N u + u' R u.
 
-    Arguments and errors as for `lqr`, with the unit circle in place of the imaginary axis.
+    Takes and raises what `lqr` does, with the unit circle in place of the imaginary axis.
     """
     P, K, _ = solve_dare(A, B, Q, R, N)
     return LinearQuadratic(K, P)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Bool, Float, Real
 
 from cpjax.errors import InputError
 from cpjax.linear.arguments import MatrixLike, matrices, shaped, square
@@ -37,20 +38,20 @@ _SMALL = 1e-12  # size of the doubled A at convergence: the missing terms are of
 
 
 class Sum(NamedTuple):
-    """Solution X (n, n, ...), and whether A is stable (...); if not, X is undefined."""
+    """Solution X, and whether A is stable; if not, X is undefined."""
 
-    X: Matrix
-    stable: jax.Array
+    X: Float[Array, "n n *batch"]
+    stable: Bool[Array, "*batch"]
 
 
-def lyapunov(A: MatrixLike, Q: MatrixLike) -> jax.Array:
-    """Returns X (n, n) of A' X + X A + Q = 0 for a stable A, all of whose eigenvalues have negative real parts.
+def lyapunov(A: Real[MatrixLike, "n n"], Q: Real[MatrixLike, "n n"]) -> Float[Array, "n n"]:
+    """Returns X of A' X + X A + Q = 0 for a stable A, all of whose eigenvalues have negative real parts.
 
     Differentiable to any order. Under jit, an unstable A gives NaN.
 
     Args:
-      A: (n, n).
-      Q: (n, n), symmetric or not.
+      A: stable.
+      Q: symmetric or not.
 
     Raises:
       InputError: shapes that do not fit, or a concrete A that is not stable.
@@ -58,14 +59,14 @@ def lyapunov(A: MatrixLike, Q: MatrixLike) -> jax.Array:
     return _solved(A, Q, lyapunov_equation, "of a stable system: every eigenvalue with a negative real part")
 
 
-def stein(A: MatrixLike, Q: MatrixLike) -> jax.Array:
-    """Returns X (n, n) of A' X A - X + Q = 0 for a stable A, all of whose eigenvalues are inside the unit circle.
+def stein(A: Real[MatrixLike, "n n"], Q: Real[MatrixLike, "n n"]) -> Float[Array, "n n"]:
+    """Returns X of A' X A - X + Q = 0 for a stable A, all of whose eigenvalues are inside the unit circle.
 
     Differentiable to any order. Under jit, an unstable A gives NaN.
 
     Args:
-      A: (n, n).
-      Q: (n, n), symmetric or not.
+      A: stable.
+      Q: symmetric or not.
 
     Raises:
       InputError: shapes that do not fit, or a concrete A that is not stable.
@@ -82,7 +83,7 @@ def _solved(A: MatrixLike, Q: MatrixLike, equation: Callable[..., jax.Array], al
     return X
 
 
-def lyapunov_equation(A: jax.Array, Q: jax.Array) -> jax.Array:
+def lyapunov_equation(A: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Solves the equation of `lyapunov` without its checks."""
     return lax.custom_linear_solve(
         lambda X: -(A.T @ X + X @ A),
@@ -92,7 +93,7 @@ def lyapunov_equation(A: jax.Array, Q: jax.Array) -> jax.Array:
     )
 
 
-def stein_equation(A: jax.Array, Q: jax.Array) -> jax.Array:
+def stein_equation(A: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Solves the equation of `stein` without its checks."""
     return lax.custom_linear_solve(
         lambda X: X - A.T @ X @ A,
@@ -102,7 +103,7 @@ def stein_equation(A: jax.Array, Q: jax.Array) -> jax.Array:
     )
 
 
-def sum_continuous(A: Matrix, Q: Matrix) -> Sum:
+def sum_continuous(A: Float[Array, "n n *batch"], Q: Float[Array, "n n *batch"]) -> Sum:
     """Solves Lyapunov's equation, matrix axes first, as Stein's equation after Cayley's transform."""
     shift = cayley_shift(A)
     resolvent = inverse(shift * identity_like(A) - A)
@@ -110,7 +111,7 @@ def sum_continuous(A: Matrix, Q: Matrix) -> Sum:
     return sum_discrete(discrete, 2.0 * shift * product(transpose(resolvent), Q, resolvent))
 
 
-def sum_discrete(A: Matrix, Q: Matrix) -> Sum:
+def sum_discrete(A: Float[Array, "n n *batch"], Q: Float[Array, "n n *batch"]) -> Sum:
     """Solves Stein's equation, matrix axes first, by doubling."""
 
     def unfinished(carry: tuple[Matrix, Matrix, jax.Array]) -> jax.Array:
@@ -126,8 +127,8 @@ def sum_discrete(A: Matrix, Q: Matrix) -> Sum:
     return Sum(X, largest(power) <= _SMALL)
 
 
-def cayley_shift(A: Matrix) -> jax.Array:
-    """Returns the geometric mean of |eigenvalues| (...), near which a shift makes doubling converge fastest."""
+def cayley_shift(A: Float[Array, "n n *batch"]) -> Float[Array, "*batch"]:
+    """Returns the geometric mean of |eigenvalues|, near which a shift makes doubling converge fastest."""
     return jnp.exp(log_abs_determinant(A) / A.shape[0])
 
 

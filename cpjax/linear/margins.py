@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool, Complex, Float, Real
 
 from cpjax.linear._crossovers import (
     Crossovers,
@@ -33,56 +34,60 @@ from cpjax.linear._crossovers import (
     roots_near,
     transfer,
 )
-from cpjax.linear.arguments import column, columns, gain_matrix, matrices, square
+from cpjax.linear.arguments import MatrixLike, column, columns, gain_matrix, matrices, square
 
 
 class Margins(NamedTuple):
-    """Margins of a stable loop at the plant's input, all scalars; for an unstable loop all but `stable` are NaN.
+    """Margins of a stable loop at the plant's input; for an unstable loop all but `stable` are NaN.
 
     The frequency of an unlimited margin is NaN.
     """
 
-    stable: jax.Array
+    stable: Bool[Array, ""]
     """Whether every closed-loop pole has a negative real part."""
-    gain_lower: jax.Array
+    gain_lower: Float[Array, ""]
     """Factor below 1 down to which the loop gain may fall; 0 if unlimited, above 0 if the plant itself is unstable."""
-    gain_lower_frequency: jax.Array
+    gain_lower_frequency: Float[Array, ""]
     """Phase crossover at which the loop would oscillate [rad/s]; 0 if a real pole would cross the axis."""
-    gain_upper: jax.Array
+    gain_upper: Float[Array, ""]
     """Factor above 1 up to which the loop gain may rise; inf if unlimited."""
-    gain_upper_frequency: jax.Array
+    gain_upper_frequency: Float[Array, ""]
     """Phase crossover at which the loop would oscillate [rad/s]; 0 if a real pole would cross the axis."""
-    phase: jax.Array
+    phase: Float[Array, ""]
     """Phase lag or lead, whichever is less, that destabilises the loop [rad]; inf if |L| = 1 nowhere."""
-    phase_frequency: jax.Array
+    phase_frequency: Float[Array, ""]
     """Gain crossover that limits `phase` [rad/s]."""
-    delay: jax.Array
+    delay: Float[Array, ""]
     """Delay that destabilises the loop [s]; inf if |L| = 1 nowhere."""
-    delay_frequency: jax.Array
+    delay_frequency: Float[Array, ""]
     """Gain crossover that limits `delay` [rad/s]; not that of `phase` where a lead or a faster crossover decides."""
-    disk: jax.Array
+    disk: Float[Array, ""]
     """Disk margin alpha in (0, 2], of skew 0: 1 / max |S - 1/2| = 2 / max |S - T|."""
-    disk_frequency: jax.Array
+    disk_frequency: Float[Array, ""]
     """Frequency of that maximum [rad/s]; inf where alpha is 2, the limit at high frequencies."""
-    disk_gain: jax.Array
+    disk_gain: Float[Array, ""]
     """g = (2 + alpha) / (2 - alpha), above 1: the disk contains every gain factor in (1/g, g)."""
-    disk_phase: jax.Array
+    disk_phase: Float[Array, ""]
     """2 atan(alpha / 2), at most pi / 2 [rad]: the disk contains every phase lag and lead below it."""
 
 
-def closed_loop_poles(A: Any, B: Any, K: Any) -> jax.Array:
+def closed_loop_poles(
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"],
+    K: Real[MatrixLike, "m n"] | Real[MatrixLike, " n"],
+) -> Complex[Array, " n"]:
     """Computes the poles of the loop u = -K s, the eigenvalues of A - B K.
 
     Where poles coincide they are not differentiable, and rounding splits a pole of multiplicity m by up to about
     eps^(1/m) of the largest: derivatives there are infinite, NaN or undefined. `characteristic_polynomial` is smooth.
 
     Args:
-      A: shape (n, n) [1/s].
-      B: shape (n, m), or (n,) for one input.
-      K: shape (m, n), or (n,) for one input.
+      A: state matrix [1/s].
+      B: input matrix; a vector for one input.
+      K: gain; a vector for one input.
 
     Returns:
-      Complex, shape (n,) [1/s], sorted by real part, then imaginary part (of a conjugate pair the lower one first).
+      The poles [1/s], sorted by real part, then imaginary part (of a conjugate pair the lower one first).
 
     Raises:
       InputError: not finite real matrices of these shapes.
@@ -94,17 +99,17 @@ def closed_loop_poles(A: Any, B: Any, K: Any) -> jax.Array:
     return jnp.sort(jnp.linalg.eigvals(A - B @ K))
 
 
-def characteristic_polynomial(A: Any) -> jax.Array:
+def characteristic_polynomial(A: Real[MatrixLike, "n n"]) -> Float[Array, " n"]:
     """Computes the coefficients of det(sI - A), smooth also where eigenvalues coincide.
 
     Uses the recursion of Faddeev and LeVerrier. The k-th coefficient has an absolute error of about eps times the k-th
     power of the norm of A, so that small ones are lost if eigenvalues differ strongly in size.
 
     Args:
-      A: shape (n, n).
+      A: any square matrix.
 
     Returns:
-      Shape (n,), highest power first, without the leading 1.
+      The coefficients, highest power first, without the leading 1.
 
     Raises:
       InputError: not a finite real square matrix.
@@ -113,16 +118,20 @@ def characteristic_polynomial(A: Any) -> jax.Array:
     return _resolvent(A, square("A", A))[0]
 
 
-def loop_polynomials(A: Any, B: Any, K: Any) -> tuple[jax.Array, jax.Array]:
+def loop_polynomials(
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n 1"] | Real[MatrixLike, " n"],
+    K: Real[MatrixLike, "1 n"] | Real[MatrixLike, " n"],
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Computes numerator N and denominator D of L(s) = K (sI - A)^-1 B; the closed loop's polynomial is N + D.
 
     Args:
-      A: shape (n, n).
-      B: shape (n, 1) or (n,).
-      K: shape (1, n) or (n,).
+      A: state matrix.
+      B: input matrix of one input.
+      K: gain.
 
     Returns:
-      N, shape (n,), from s^(n-1) down, and D, shape (n,), of the same powers, without its leading 1.
+      N, from s^(n-1) down, and D, of the same powers, without its leading 1.
 
     Raises:
       InputError: not finite real matrices of these shapes.
@@ -132,7 +141,11 @@ def loop_polynomials(A: Any, B: Any, K: Any) -> tuple[jax.Array, jax.Array]:
     return jnp.stack([K @ M @ B for M in adjugate]), D
 
 
-def margins(A: Any, B: Any, K: Any) -> Margins:
+def margins(
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n 1"] | Real[MatrixLike, " n"],
+    K: Real[MatrixLike, "1 n"] | Real[MatrixLike, " n"],
+) -> Margins:
     """Computes the margins of the continuous-time loop u = -K s, broken at the plant's input.
 
     The two gain margins bound the interval around 1 of the factors on K that keep the loop stable. The phase margin is
@@ -148,9 +161,12 @@ def margins(A: Any, B: Any, K: Any) -> Margins:
     over, the derivative is that of one side. Values that are 0, infinite or NaN have the derivative 0.
 
     Args:
-      A: shape (n, n) [1/s].
-      B: shape (n, 1) or (n,).
-      K: shape (1, n) or (n,).
+      A: state matrix [1/s].
+      B: input matrix of one input.
+      K: gain.
+
+    Returns:
+      The margins and the frequencies that limit them.
 
     Raises:
       InputError: not finite real matrices of these shapes. An unstable loop is no error: its margins are NaN.

@@ -19,6 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Complex, Float, Num, Real
 
 from cpjax.errors import InputError
 from cpjax.linear.arguments import MatrixLike, column, matrices, shaped, square
@@ -34,16 +36,20 @@ from cpjax.numeric.small_matrices import (
     transpose,
 )
 from cpjax.numeric.transforms import from_positive, positive
-from cpjax.pytree import Array, is_traced
+from cpjax.pytree import is_traced
 
 
-def place(A: MatrixLike, B: MatrixLike, poles: Array | Sequence[complex]) -> jax.Array:
-    """Returns the gain K (1, n) of u = -K s that gives A - B K these eigenvalues; see `place_polynomial`.
+def place(
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n 1"] | Real[MatrixLike, " n"],
+    poles: Num[ArrayLike, " n"] | Sequence[complex],
+) -> Float[Array, "1 n"]:
+    """Returns the gain K of u = -K s that gives A - B K these eigenvalues; see `place_polynomial`.
 
     Args:
-      A: (n, n) [1/s].
-      B: (n, 1) or (n,).
-      poles: n of them, real or in complex conjugate pairs, in any order, repeated or not [1/s].
+      A: state matrix [1/s].
+      B: input matrix of one input.
+      poles: real or in complex conjugate pairs, in any order, repeated or not [1/s].
 
     Raises:
       InputError: shapes that do not fit, concrete poles that are not closed under conjugation, or a concrete pair
@@ -55,15 +61,19 @@ def place(A: MatrixLike, B: MatrixLike, poles: Array | Sequence[complex]) -> jax
     return place_polynomial(A, B, coefficients.astype(A.dtype))
 
 
-def place_polynomial(A: MatrixLike, B: MatrixLike, coefficients: Array | Sequence[float]) -> jax.Array:
-    """Returns the gain K (1, n) of u = -K s that gives A - B K this characteristic polynomial.
+def place_polynomial(
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n 1"] | Real[MatrixLike, " n"],
+    coefficients: Real[MatrixLike, " n"],
+) -> Float[Array, "1 n"]:
+    """Returns the gain K of u = -K s that gives A - B K this characteristic polynomial.
 
     Differentiable to any order in all arguments.
 
     Args:
-      A: (n, n) [1/s].
-      B: (n, 1) or (n,).
-      coefficients: (n,), of s^(n-1) down to s^0; that of s^n is 1.
+      A: state matrix [1/s].
+      B: input matrix of one input.
+      coefficients: of s^(n-1) down to s^0; that of s^n is 1.
 
     Raises:
       InputError: shapes that do not fit, or a concrete pair (A, B) that is not controllable. Under jit the gain is NaN
@@ -78,8 +88,8 @@ def place_polynomial(A: MatrixLike, B: MatrixLike, coefficients: Array | Sequenc
     return K
 
 
-def polynomial_from_poles(poles: Array | Sequence[complex]) -> jax.Array:
-    """Returns the coefficients (n,), from s^(n-1) down to s^0, of the monic polynomial with these roots.
+def polynomial_from_poles(poles: Num[ArrayLike, " n"] | Sequence[complex]) -> Float[Array, " n"]:
+    """Returns the coefficients, from s^(n-1) down to s^0, of the monic polynomial with these roots.
 
     Raises:
       InputError: not a sequence of finite numbers, or concrete ones that are not closed under conjugation. Under jit
@@ -122,15 +132,15 @@ class QuadraticFactors(NamedTuple):
     pair and the poles themselves have no derivative: use them, or their logarithms, as parameters of a design.
     """
 
-    a: jax.Array
-    """Shape (n // 2,): 2 zeta omega, twice the mean rate of decay [1/s]."""
-    b: jax.Array
-    """Shape (n // 2,): omega^2 [1/s^2]."""
-    c: jax.Array
-    """Shape (n % 2,): the rate of decay of the single real pole [1/s]."""
+    a: Float[Array, " pairs"]
+    """2 zeta omega, twice the mean rate of decay [1/s]."""
+    b: Float[Array, " pairs"]
+    """omega^2 [1/s^2]."""
+    c: Float[Array, " single"]
+    """None or one: the rate of decay of the single real pole [1/s]."""
 
     @classmethod
-    def from_poles(cls, poles: Array | Sequence[complex]) -> "QuadraticFactors":
+    def from_poles(cls, poles: Num[ArrayLike, " n"] | Sequence[complex]) -> "QuadraticFactors":
         """Computes the factors of poles [1/s]: conjugate pairs, then neighbours among the real ones, slowest first.
 
         Raises:
@@ -154,18 +164,18 @@ class QuadraticFactors(NamedTuple):
         return cls(jnp.asarray(a), jnp.asarray(b), jnp.asarray(real[len(real) // 2 * 2 :]))
 
     @classmethod
-    def from_unconstrained(cls, x: jax.Array) -> "QuadraticFactors":
-        """Maps any real vector (n,) to factors, one to one: the numbers are the exponentials of its elements."""
+    def from_unconstrained(cls, x: Float[Array, " n"]) -> "QuadraticFactors":
+        """Maps any real vector to factors, one to one: the numbers are the exponentials of its elements."""
         pairs = x.shape[0] // 2
         y = positive(x)
         return cls(y[:pairs], y[pairs : 2 * pairs], y[2 * pairs :])
 
-    def unconstrained(self) -> jax.Array:
-        """Returns the vector (n,) that `from_unconstrained` maps to these factors."""
+    def unconstrained(self) -> Float[Array, " n"]:
+        """Returns the vector that `from_unconstrained` maps to these factors."""
         return from_positive(jnp.concatenate([self.a, self.b, self.c]))
 
-    def polynomial(self) -> jax.Array:
-        """Returns the coefficients (n,) that `place_polynomial` takes."""
+    def polynomial(self) -> Float[Array, " n"]:
+        """Returns the coefficients that `place_polynomial` takes."""
         whole = jnp.ones((1,), dtype=self.a.dtype)
         for i in range(self.a.shape[0]):
             whole = jnp.convolve(whole, jnp.stack([jnp.ones_like(self.a[i]), self.a[i], self.b[i]]))
@@ -173,8 +183,8 @@ class QuadraticFactors(NamedTuple):
             whole = jnp.convolve(whole, jnp.stack([jnp.ones_like(self.c[i]), self.c[i]]))
         return whole[1:]
 
-    def poles(self) -> jax.Array:
-        """Returns the complex roots (n,) [1/s], for display: they have no derivative where two of them meet."""
+    def poles(self) -> Complex[Array, " n"]:
+        """Returns the roots [1/s], for display: they have no derivative where two of them meet."""
         root = jnp.sqrt(lax.complex(self.a * self.a / 4 - self.b, jnp.zeros_like(self.a)))
         # The larger root: in the formula for the other one, the digits of a slow pole would cancel.
         first = -root - (0.5 * self.a).astype(root.dtype)

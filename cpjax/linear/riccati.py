@@ -26,40 +26,55 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Real
 
 from cpjax.errors import InputError
 from cpjax.linear._doubling import solve_continuous, solve_discrete
 from cpjax.linear.arguments import MatrixLike, columns, input_weight, matrices, shaped, square
 from cpjax.linear.lyapunov import lyapunov_equation, stein_equation
-from cpjax.numeric.small_matrices import (
-    linear_solve,
-)
-from cpjax.pytree import is_traced
+from cpjax.numeric.small_matrices import linear_solve
+from cpjax.pytree import Scalar, is_traced
 
 Problem: TypeAlias = tuple[Any, Any, Any, Any, Any]
 """A (n, n), B (n, m), Q (n, n), R (m, m), N (n, m)."""
 
 
 class RiccatiSolution(NamedTuple):
-    """Solution P (n, n), gain K (m, n), and whether they were found; if not, both are NaN."""
+    """Solution P, gain K, and whether they were found; if not, both are NaN."""
 
-    P: jax.Array
-    K: jax.Array
-    found: jax.Array
+    P: Float[Array, "n n"]
+    K: Float[Array, "m n"]
+    found: Bool[Array, ""]
 
 
-def care(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> jax.Array:
-    """Returns P (n, n) of the continuous-time algebraic Riccati equation; see `solve_care`."""
+def care(
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"],
+    Q: Real[MatrixLike, "n n"],
+    R: Real[MatrixLike, "m m"] | Scalar,
+    N: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"] | None = None,
+) -> Float[Array, "n n"]:
+    """Returns P of the continuous-time algebraic Riccati equation; see `solve_care`."""
     return solve_care(A, B, Q, R, N).P
 
 
-def dare(A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None) -> jax.Array:
-    """Returns P (n, n) of the discrete-time algebraic Riccati equation; see `solve_dare`."""
+def dare(
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"],
+    Q: Real[MatrixLike, "n n"],
+    R: Real[MatrixLike, "m m"] | Scalar,
+    N: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"] | None = None,
+) -> Float[Array, "n n"]:
+    """Returns P of the discrete-time algebraic Riccati equation; see `solve_dare`."""
     return solve_dare(A, B, Q, R, N).P
 
 
 def solve_care(
-    A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"],
+    Q: Real[MatrixLike, "n n"],
+    R: Real[MatrixLike, "m m"] | Scalar,
+    N: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"] | None = None,
 ) -> RiccatiSolution:
     """Solves the continuous-time Riccati equation for its stabilising solution, with its gain.
 
@@ -70,11 +85,14 @@ def solve_care(
     then singular.
 
     Args:
-      A: (n, n).
-      B: (n, m), or (n,) for one input.
-      Q: (n, n), symmetric, positive semidefinite.
-      R: (m, m), symmetric, positive definite; or a number for one input.
-      N: (n, m), such that [[Q, N], [N', R]] is positive semidefinite; zero if left out.
+      A: state matrix.
+      B: input matrix; a vector for one input.
+      Q: symmetric, positive semidefinite.
+      R: symmetric, positive definite; a number for one input.
+      N: such that [[Q, N], [N', R]] is positive semidefinite; zero if left out; a vector for one input.
+
+    Returns:
+      P, K, and whether they were found.
 
     Raises:
       InputError: shapes that do not fit, a concrete Q, R or N that is not as above, a concrete pair (A, B) that is not
@@ -85,7 +103,11 @@ def solve_care(
 
 
 def solve_dare(
-    A: MatrixLike, B: MatrixLike, Q: MatrixLike, R: MatrixLike, N: MatrixLike | None = None
+    A: Real[MatrixLike, "n n"],
+    B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"],
+    Q: Real[MatrixLike, "n n"],
+    R: Real[MatrixLike, "m m"] | Scalar,
+    N: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"] | None = None,
 ) -> RiccatiSolution:
     """Solves the discrete-time Riccati equation for its stabilising solution, with its gain; as `solve_care`.
 

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Bool, Float, Int32, Real
 
 from cpjax.errors import InputError
-from cpjax.linear.arguments import columns, matrices, rows, square
+from cpjax.linear.arguments import MatrixLike, columns, matrices, rows, square
 from cpjax.linear.lyapunov import lyapunov
 from cpjax.pytree import Number, Scalar, is_traced
 
@@ -22,30 +23,32 @@ _MOST_DOUBLINGS = 60
 class Structure(NamedTuple):
     """A controllability or observability matrix, and its rank and conditioning."""
 
-    matrix: jax.Array
+    matrix: Float[Array, "rows columns"]
     """Shape (n, n m) or (n p, n)."""
-    rank: jax.Array
-    """int32: singular values above eps times the matrix's longer side times the largest one."""
-    singular_values: jax.Array
-    """Shape (n,), descending."""
-    condition: jax.Array
+    rank: Int32[Array, ""]
+    """Singular values above eps times the matrix's longer side times the largest one."""
+    singular_values: Float[Array, " n"]
+    """Descending."""
+    condition: Float[Array, ""]
     """Largest over smallest singular value; inf if that is 0. It depends on the states' units."""
 
     @property
-    def full(self) -> jax.Array:
+    def full(self) -> Bool[Array, ""]:
         """Whether the rank is n, so that the pair is controllable or observable."""
         return self.rank == self.singular_values.shape[-1]
 
 
-def controllability_matrix(A: Any, B: Any) -> jax.Array:
+def controllability_matrix(
+    A: Real[MatrixLike, "n n"], B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"]
+) -> Float[Array, "n nm"]:
     """Computes [B, A B, ..., A^(n-1) B].
 
     Args:
-      A: shape (n, n).
-      B: shape (n, m), or (n,) for one input.
+      A: state matrix.
+      B: input matrix; a vector for one input.
 
     Returns:
-      Shape (n, n m).
+      n blocks of m columns each.
 
     Raises:
       InputError: not finite real matrices of these shapes.
@@ -57,15 +60,17 @@ def controllability_matrix(A: Any, B: Any) -> jax.Array:
     return jnp.concatenate(blocks, axis=1)
 
 
-def observability_matrix(A: Any, C: Any) -> jax.Array:
+def observability_matrix(
+    A: Real[MatrixLike, "n n"], C: Real[MatrixLike, "p n"] | Real[MatrixLike, " n"]
+) -> Float[Array, "np n"]:
     """Computes [C; C A; ...; C A^(n-1)].
 
     Args:
-      A: shape (n, n).
-      C: shape (p, n), or (n,) for one output.
+      A: state matrix.
+      C: output matrix; a vector for one output.
 
     Returns:
-      Shape (n p, n).
+      n blocks of p rows each.
 
     Raises:
       InputError: not finite real matrices of these shapes.
@@ -74,15 +79,15 @@ def observability_matrix(A: Any, C: Any) -> jax.Array:
     return controllability_matrix(A.T, C.T).T
 
 
-def controllability(A: Any, B: Any) -> Structure:
+def controllability(A: Real[MatrixLike, "n n"], B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"]) -> Structure:
     """Computes rank and conditioning of the controllability matrix.
 
     The rank is subject to rounding: the matrix holds powers of A, so that beyond about eight states, or with fast and
     slow modes together, a controllable pair may lack rank. A Gramian is then the more reliable test.
 
     Args:
-      A: shape (n, n).
-      B: shape (n, m), or (n,) for one input.
+      A: state matrix.
+      B: input matrix; a vector for one input.
 
     Raises:
       InputError: not finite real matrices of these shapes.
@@ -90,12 +95,12 @@ def controllability(A: Any, B: Any) -> Structure:
     return _structure(controllability_matrix(A, B))
 
 
-def observability(A: Any, C: Any) -> Structure:
+def observability(A: Real[MatrixLike, "n n"], C: Real[MatrixLike, "p n"] | Real[MatrixLike, " n"]) -> Structure:
     """Computes rank and conditioning of the observability matrix; see `controllability`.
 
     Args:
-      A: shape (n, n).
-      C: shape (p, n), or (n,) for one output.
+      A: state matrix.
+      C: output matrix; a vector for one output.
 
     Raises:
       InputError: not finite real matrices of these shapes.
@@ -103,7 +108,9 @@ def observability(A: Any, C: Any) -> Structure:
     return _structure(observability_matrix(A, C))
 
 
-def controllability_gramian(A: Any, B: Any, horizon: Scalar | None = None) -> jax.Array:
+def controllability_gramian(
+    A: Real[MatrixLike, "n n"], B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"], horizon: Scalar | None = None
+) -> Float[Array, "n n"]:
     """Computes W, the integral from 0 to `horizon` of e^(A t) B B' e^(A' t) dt.
 
     x' W^-1 x is the least input energy that takes the state from rest at 0 to x within the horizon.
@@ -114,12 +121,12 @@ def controllability_gramian(A: Any, B: Any, horizon: Scalar | None = None) -> ja
     e^(A horizon) overflows, so does W. (The block exponential alone loses digits with e^(norm(A) * horizon).)
 
     Args:
-      A: shape (n, n) [1/s].
-      B: shape (n, m), or (n,) for one input.
+      A: state matrix [1/s].
+      B: input matrix; a vector for one input.
       horizon: [s], at least 0; None or inf for all time, which requires a stable A. A traced one must be finite.
 
     Returns:
-      Symmetric, shape (n, n). For all time it is NaN inside jit if A is not stable.
+      W, symmetric. For all time it is NaN inside jit if A is not stable.
 
     Raises:
       InputError: not finite real matrices of these shapes; a negative horizon; an infinite one where a concrete A is
@@ -129,19 +136,21 @@ def controllability_gramian(A: Any, B: Any, horizon: Scalar | None = None) -> ja
     return _gramian(A, B @ B.T, horizon)
 
 
-def observability_gramian(A: Any, C: Any, horizon: Scalar | None = None) -> jax.Array:
+def observability_gramian(
+    A: Real[MatrixLike, "n n"], C: Real[MatrixLike, "p n"] | Real[MatrixLike, " n"], horizon: Scalar | None = None
+) -> Float[Array, "n n"]:
     """Computes W, the integral from 0 to `horizon` of e^(A' t) C' C e^(A t) dt.
 
     x' W x is the output's energy over the horizon, from the state x without input. For accuracy see
     `controllability_gramian`.
 
     Args:
-      A: shape (n, n) [1/s].
-      C: shape (p, n), or (n,) for one output.
+      A: state matrix [1/s].
+      C: output matrix; a vector for one output.
       horizon: [s], at least 0; None or inf for all time, which requires a stable A. A traced one must be finite.
 
     Returns:
-      Symmetric, shape (n, n). For all time it is NaN inside jit if A is not stable.
+      W, symmetric. For all time it is NaN inside jit if A is not stable.
 
     Raises:
       InputError: not finite real matrices of these shapes; a negative horizon; an infinite one where a concrete A is

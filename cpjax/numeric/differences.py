@@ -1,24 +1,23 @@
 """Derivatives by extrapolated central differences, with an estimate of their error (Ridders, 1982)."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-
-Numbers: TypeAlias = np.ndarray[Any, Any]
+from jaxtyping import Bool, Float
 
 
 class Differences(NamedTuple):
-    """A derivative and its estimated error, of one shape; NaN and infinite where no difference is valid."""
+    """A derivative and its estimated error; NaN and infinite where no difference is valid."""
 
-    derivative: Numbers
-    uncertainty: Numbers
+    derivative: Float[np.ndarray, "*functions"]
+    uncertainty: Float[np.ndarray, "*functions"]
 
 
 def central_differences(
-    function: Callable[[float], tuple[Numbers, Numbers]],
-    steps: Numbers,
-    valid: Callable[[float], Numbers] | None = None,
+    function: Callable[[float], tuple[Float[np.ndarray, "*functions"], Float[np.ndarray, "*functions"]]],
+    steps: Float[np.ndarray, " steps"],
+    valid: Callable[[float], Bool[np.ndarray, "*functions"]] | None = None,
 ) -> Differences:
     """Computes the derivative at 0 of a function of one variable, or of many such functions at once.
 
@@ -27,13 +26,15 @@ def central_differences(
     some are small by chance, so no change counts as smaller than the rounding error of the function's values.
 
     Args:
-      function: takes a step h and returns the function at +h and at -h, arrays of one shape (...).
+      function: takes a step h and returns the function at +h and at -h.
       steps: step sizes, at least two, falling by a constant factor.
-      valid: takes a step and returns whether its difference counts, shape (...); for functions that are smooth only
-        near 0.
+      valid: takes a step and returns whether its difference counts; for functions that are smooth only near 0.
+
+    Returns:
+      The derivative of each function, and its estimated error.
     """
     factor = (steps[0] / steps[1]) ** 2
-    rows: list[list[Numbers]] = []
+    rows: list[list[np.ndarray]] = []
     best = Differences(np.array(np.nan), np.array(np.inf))
     for step in steps:
         above, below = function(float(step))

@@ -13,21 +13,22 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
 
 class DoubleWord(NamedTuple):
-    """The number high + low, |low| at most half a unit in the last place of high. Two arrays of one shape."""
+    """The number high + low, |low| at most half a unit in the last place of high."""
 
-    high: jax.Array
-    low: jax.Array
+    high: Float[Array, "*shape"]
+    low: Float[Array, "*shape"]
 
 
-def double_word(x: jax.Array) -> DoubleWord:
+def double_word(x: Float[Array, "..."]) -> DoubleWord:
     """Converts a plain float array to double-word numbers."""
     return DoubleWord(x, jnp.zeros_like(x))
 
 
-def two_sum(a: jax.Array, b: jax.Array) -> DoubleWord:
+def two_sum(a: Float[Array, "*#shape"], b: Float[Array, "*#shape"]) -> DoubleWord:
     """Computes a + b exactly (Knuth).
 
     The barrier is needed where one of the two is a constant of the program: XLA would simplify (a + b) - a to b.
@@ -51,7 +52,7 @@ def _split(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     return high, x - high
 
 
-def two_product(a: jax.Array, b: jax.Array) -> DoubleWord:
+def two_product(a: Float[Array, "*#shape"], b: Float[Array, "*#shape"]) -> DoubleWord:
     """Computes a b to twice the working precision."""
     a_high, a_low = _split(a)
     b_high, b_low = _split(b)

@@ -1,20 +1,20 @@
 """Pareto fronts of two costs: non-dominated points and the area that they dominate."""
 
-from typing import Any
-
 import numpy as np
+from jaxtyping import Float, Int
 
-Numbers = np.ndarray[Any, Any]
 
-
-def nondominated(points: Numbers) -> Numbers:
+def nondominated(points: Float[np.ndarray, "points 2"]) -> Int[np.ndarray, " front"]:
     """Returns the indices of the non-dominated points, in ascending order of the first cost.
 
     A point is dominated if another one is at least as good in both costs and better in one. Of equal points only the
     first is returned; points with a non-finite number are never returned.
 
     Args:
-      points: costs, shape (n, 2); smaller is better.
+      points: costs; smaller is better.
+
+    Returns:
+      The indices.
     """
     points = np.asarray(points, float)
     finite = np.flatnonzero(np.all(np.isfinite(points), axis=1))
@@ -24,8 +24,16 @@ def nondominated(points: Numbers) -> Numbers:
     return order[second < best_before]
 
 
-def hypervolume(points: Numbers, reference: Numbers) -> float:
-    """Computes the area that points (n, 2) dominate up to `reference` (2,) (Zitzler and Thiele, 1998)."""
+def hypervolume(points: Float[np.ndarray, "points 2"], reference: Float[np.ndarray, "2"]) -> float:
+    """Computes the area that points dominate up to a reference point (Zitzler and Thiele, 1998).
+
+    Args:
+      points: costs; smaller is better.
+      reference: the costs beyond which a point dominates nothing.
+
+    Returns:
+      The area, in the product of the costs' units.
+    """
     points, reference = np.asarray(points, float), np.asarray(reference, float)
     front = points[nondominated(points)]
     front = front[np.all(front < reference, axis=1)]

@@ -8,17 +8,17 @@ of operations and without a derivative. A Newton correction supplies the derivat
 by the implicit function theorem at the time t at which g(t, p) = 0.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float
 
 from cpjax.pytree import Scalar
 
 _ITERATIONS = 8
 
 
-def crossing_fraction(start: Scalar, start_slope: Scalar, end: Scalar, end_slope: Scalar) -> jax.Array:
+def crossing_fraction(start: Scalar, start_slope: Scalar, end: Scalar, end_slope: Scalar) -> Float[Array, ""]:
     """Returns the fraction in [0, 1] at which the cubic with these end values and slopes falls below zero.
 
     `start` counts as positive whatever its sign, because within rounding of zero it may have either; if the cubic is
@@ -29,6 +29,9 @@ def crossing_fraction(start: Scalar, start_slope: Scalar, end: Scalar, end_slope
     Args:
       start, start_slope: value and slope (per unit of the fraction) at 0.
       end, end_slope: value, below 0, and slope at 1.
+
+    Returns:
+      The fraction [1].
     """
     start, start_slope, end, end_slope = (lax.stop_gradient(x) for x in (start, start_slope, end, end_slope))
     rise = end - start
@@ -47,7 +50,7 @@ def crossing_fraction(start: Scalar, start_slope: Scalar, end: Scalar, end_slope
     return t
 
 
-def newton_correction(value: Scalar, slope: Scalar, steepness: Scalar) -> jax.Array:
+def newton_correction(value: Scalar, slope: Scalar, steepness: Scalar) -> Float[Array, ""]:
     """Returns the Newton step -value / slope from a time at which a falling function has `value` to its zero.
 
     Its derivative is -1 / slope, by the implicit function theorem; the slope's own derivative is left out, because it
@@ -59,6 +62,9 @@ def newton_correction(value: Scalar, slope: Scalar, steepness: Scalar) -> jax.Ar
       slope: dg/dt there [unit of `value` per unit of time]. A slope that is not clearly negative, as where g only
         touches zero, is replaced by -1e-6 `steepness`, so that value and derivative stay finite.
       steepness: a typical |slope| of the function nearby, the scale for a small slope.
+
+    Returns:
+      The step [unit of time].
     """
     value = jnp.asarray(value)
     least = 1e-6 * lax.stop_gradient(steepness) + float(np.finfo(value.dtype).tiny) ** 0.25

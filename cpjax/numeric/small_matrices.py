@@ -11,42 +11,46 @@ steps and recompute each of them wherever a later one reads it.
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool, Float
 
 from cpjax.numeric import double_word as dw
 from cpjax.numeric.double_word import DoubleWord
 
-Matrix: TypeAlias = jax.Array
-"""Shape (rows, columns, ...)."""
+Matrix: TypeAlias = Float[Array, "_ _ ..."]
+"""A matrix of any size, with any batch axes."""
+
+M = TypeVar("M", Matrix, DoubleWord)
 
 
-def transpose(a: Any) -> Any:
+def transpose(a: M) -> M:
     """Exchanges the matrix axes of a plain or double-word matrix."""
-    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), a)
+    exchanged: M = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), a)
+    return exchanged
 
 
-def identity_like(a: Matrix) -> Matrix:
+def identity_like(a: Float[Array, "n n *batch"]) -> Float[Array, "n n *batch"]:
     """Returns the identity with the size, dtype and batch of a square matrix."""
     n = a.shape[0]
     return jnp.broadcast_to(jnp.eye(n, dtype=a.dtype).reshape((n, n) + (1,) * (a.ndim - 2)), a.shape)
 
 
-def symmetric(a: Matrix) -> Matrix:
+def symmetric(a: Float[Array, "n n *batch"]) -> Float[Array, "n n *batch"]:
     """Returns the symmetric part (a + a') / 2."""
     return 0.5 * (a + transpose(a))
 
 
-def diagonal(a: Matrix) -> jax.Array:
-    """Returns the diagonal, shape (n, ...)."""
+def diagonal(a: Float[Array, "n n *batch"]) -> Float[Array, " n *batch"]:
+    """Returns the diagonal."""
     return jnp.stack([a[i, i] for i in range(a.shape[0])])
 
 
-def largest(a: Matrix) -> jax.Array:
-    """Returns the largest absolute value among a matrix's elements, shape (...)."""
+def largest(a: Float[Array, "_ _ *batch"]) -> Float[Array, "*batch"]:
+    """Returns the largest absolute value among a matrix's elements."""
     return jnp.max(jnp.abs(a), axis=(0, 1))
 
 
@@ -59,24 +63,24 @@ def product(*factors: Matrix) -> Matrix:
     return functools.reduce(times, factors)
 
 
-def solve(a: Matrix, b: Matrix) -> Matrix:
+def solve(a: Float[Array, "n n *batch"], b: Float[Array, "n k *batch"]) -> Float[Array, "n k *batch"]:
     """Computes a^-1 b by Gauss-Jordan elimination with partial pivoting; a singular `a` gives infinities or NaN."""
     reduced, _ = _eliminate(jnp.concatenate([a, b], axis=1))
     return reduced[:, a.shape[0] :]
 
 
-def inverse(a: Matrix) -> Matrix:
+def inverse(a: Float[Array, "n n *batch"]) -> Float[Array, "n n *batch"]:
     """Computes a^-1; see `solve`."""
     return solve(a, identity_like(a))
 
 
-def log_abs_determinant(a: Matrix) -> jax.Array:
-    """Computes log |det a|, shape (...); -inf for a singular matrix."""
+def log_abs_determinant(a: Float[Array, "n n *batch"]) -> Float[Array, "*batch"]:
+    """Computes log |det a|; -inf for a singular matrix."""
     return _eliminate(a)[1]
 
 
-def is_positive_definite(a: Matrix) -> jax.Array:
-    """Returns whether a symmetric matrix is positive definite, shape (...): its pivots, in order, are all positive."""
+def is_positive_definite(a: Float[Array, "n n *batch"]) -> Bool[Array, "*batch"]:
+    """Returns whether a symmetric matrix is positive definite: its pivots, in order, are all positive."""
 
     def step(k: jax.Array, carry: tuple[Matrix, jax.Array]) -> tuple[Matrix, jax.Array]:
         rows, positive = carry
@@ -185,8 +189,8 @@ def _solve(a: Matrix, b: Matrix) -> Matrix:
     return solve(a, b)
 
 
-def linear_solve(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Computes a^-1 b of plain matrices (n, n) and (n, k); differentiable to any order, fast under `vmap`."""
+def linear_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[Array, "n k"]:
+    """Computes a^-1 b of plain matrices; differentiable to any order, fast under `vmap`."""
     return lax.custom_linear_solve(
         lambda x: a @ x, b, lambda _, b: _solve(a, b), transpose_solve=lambda _, b: _solve(a.T, b)
     )

@@ -14,6 +14,11 @@ _MOST = 2**53  # whole numbers up to here are exact as floats
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Returns the two-sided Wilson score interval `(low, high)` of a proportion, within [0, 1] (Wilson, 1927).
 
+    Args:
+      successes: number of trials that succeeded.
+      trials: number of all trials.
+      confidence: probability with which such intervals contain the true proportion.
+
     Raises:
       InputError: `trials` below 1, `successes` outside 0..trials, or `confidence` outside (0, 1).
     """
@@ -33,6 +38,10 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
 
 def two_proportion_p_value(successes_a: int, trials_a: int, successes_b: int, trials_b: int) -> float:
     """Returns the p-value of the two-sided, pooled two-proportion z-test; 1.0 where both rates are 0 or both are 1.
+
+    Args:
+      successes_a, trials_a: trials of the first treatment that succeeded, and all of them.
+      successes_b, trials_b: the same of the second treatment.
 
     Raises:
       InputError: `trials` below 1, or `successes` outside 0..trials, of either.

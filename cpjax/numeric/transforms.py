@@ -1,26 +1,26 @@
 """Maps between the unconstrained parameters of an optimiser and the constrained ones of a design."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array, Float
 
 from cpjax.errors import InputError
 from cpjax.pytree import is_traced
 
 
-def positive(x: jax.Array) -> jax.Array:
+def positive(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Returns exp(x), element by element: a step in x is a relative change of the result, whatever its unit."""
     return jnp.exp(x)
 
 
-def from_positive(y: jax.Array) -> jax.Array:
+def from_positive(y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Returns the x that `positive` maps to y."""
     return jnp.log(y)
 
 
-def semidefinite(x: jax.Array) -> jax.Array:
-    """Returns L L' (n, n), where x (n (n + 1) / 2,) fills the lower triangle L row by row.
+def semidefinite(x: Float[Array, " triangle"]) -> Float[Array, "n n"]:
+    """Returns L L', where the n (n + 1) / 2 numbers of x fill the lower triangle L row by row.
 
     Every symmetric, positive semidefinite matrix has this form, singular ones included. The map is not one to one: a
     column of L may change its sign. At a column of zeros the derivative is zero: an optimiser that starts there stays
@@ -37,8 +37,8 @@ def semidefinite(x: jax.Array) -> jax.Array:
     return L @ L.T
 
 
-def from_semidefinite(Q: jax.Array) -> jax.Array:
-    """Returns an x that `semidefinite` maps to Q (n, n): the Cholesky factor, with zeros where a pivot vanishes.
+def from_semidefinite(Q: Float[Array, "n n"]) -> Float[Array, " triangle"]:
+    """Returns an x that `semidefinite` maps to Q: the Cholesky factor, with zeros where a pivot vanishes.
 
     Raises:
       InputError: a concrete Q that is not symmetric and positive semidefinite. Under jit x is then undefined.

@@ -16,14 +16,14 @@ gives (paper, section III, with its sign error corrected; see docs/paper.md)
 import math
 from typing import Any, TypeAlias
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from cpjax.backend.trigonometry import LARGEST_TURN, rotate_by, sin_cos
 from cpjax.checks import call, real
 from cpjax.plant.motor import Motor
 from cpjax.plant.state import ANGLE_LIMIT, NAMES, RUNAWAY_LIMIT, UNITS, State
-from cpjax.pytree import Number, Scalar, number, part, pytree
+from cpjax.pytree import Number, Scalar, Scalars, number, part, pytree
 
 Pair: TypeAlias = tuple[Scalar, Scalar]
 """Pair of scalars: cart, pole."""
@@ -51,14 +51,14 @@ def _fifth_of_critical_damping(plant: "CartPole") -> float:
 class CartPole:
     """Cart, pole and motor. Defaults: the paper's appendix (a point bob on a massless pole, no friction)."""
 
-    cart_mass: Scalar = number("kg", "mass of the cart, m_1", default=1.0, above=0.0, uncertain=True)
-    pole_mass: Scalar = number("kg", "mass of the pole, m_2", default=0.5, above=0.0, uncertain=True)
-    pole_length: Scalar = number("m", "pivot to the pole's centre of mass, l", default=0.7, above=0.0, uncertain=True)
-    gravity: Scalar = number("m/s^2", "gravity, g", default=9.81, above=0.0)
-    pole_inertia: Scalar = number(
+    cart_mass: Scalars = number("kg", "mass of the cart, m_1", default=1.0, above=0.0, uncertain=True)
+    pole_mass: Scalars = number("kg", "mass of the pole, m_2", default=0.5, above=0.0, uncertain=True)
+    pole_length: Scalars = number("m", "pivot to the pole's centre of mass, l", default=0.7, above=0.0, uncertain=True)
+    gravity: Scalars = number("m/s^2", "gravity, g", default=9.81, above=0.0)
+    pole_inertia: Scalars = number(
         "kg m^2", "pole inertia about its centre of mass, J", default=0.0, at_least=0.0, typical=_swing
     )
-    cart_friction: Scalar = number(
+    cart_friction: Scalars = number(
         "N s/m",
         "viscous friction of the cart, c",
         default=0.0,
@@ -67,7 +67,7 @@ class CartPole:
         typical=lambda plant: plant.motor.damping,
         change=0.1,
     )
-    pivot_friction: Scalar = number(
+    pivot_friction: Scalars = number(
         "N m s/rad",
         "viscous friction of the pivot, b",
         default=0.0,
@@ -126,7 +126,7 @@ class CartPole:
         """Returns sine and cosine of theta, the only functions of the positions in the accelerations."""
         return sin_cos(q[1])
 
-    def geometry_near(self, geometry: Pair, change: Pair) -> tuple[Pair, jax.Array]:
+    def geometry_near(self, geometry: Pair, change: Pair) -> tuple[Pair, Bool[Array, ""]]:
         """Returns sine and cosine of theta after a `change` of the positions, and whether they are rounding-accurate.
 
         Args:

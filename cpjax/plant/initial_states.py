@@ -27,7 +27,7 @@ START_SETS = tuple(_SETS)
 
 
 def sample_starts(name: str, count: int, *, seed: int, dtype: Any = np.float64) -> State:
-    """Draws `count` initial states from a named set, as a State of NumPy arrays of shape (count,).
+    """Draws initial states from a named set.
 
     hanging: |x| <= 0.1 m, x_dot = 0, theta = pi +- 0.3 rad, |theta_dot| <= 0.3 rad/s.
     anywhere: |x| <= 0.3 m, |x_dot| <= 0.5 m/s, theta anywhere on the circle, |theta_dot| <= 4 rad/s.
@@ -37,7 +37,12 @@ def sample_starts(name: str, count: int, *, seed: int, dtype: Any = np.float64) 
 
     Args:
       name: one of `START_SETS`.
+      count: number of initial states.
+      seed: of the random numbers.
       dtype: float32 or float64; the numbers are drawn in float64 and then cast.
+
+    Returns:
+      A State of NumPy arrays of shape (count,).
 
     Raises:
       InputError: an unknown set, a count outside 1 to 10^8, a negative seed, or another dtype.

@@ -5,6 +5,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from cpjax.errors import InputError
 from cpjax.plant.cartpole import CartPole
@@ -15,17 +16,20 @@ from cpjax.pytree import check, is_traced
 class LinearModel(NamedTuple):
     """Linear model s' = A s + B u about an equilibrium, in the state order x, x_dot, theta, theta_dot."""
 
-    A: jax.Array
-    """Shape (4, 4)."""
-    B: jax.Array
-    """Shape (4, 1), per volt."""
+    A: Float[Array, "4 4"]
+    B: Float[Array, "4 1"]
+    """Per volt."""
 
 
 def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | State = "upright") -> LinearModel:
-    """Computes A (4, 4) and B (4, 1) of the plant about an equilibrium at zero voltage, by forward differentiation.
+    """Computes A and B of the plant about an equilibrium at zero voltage, by forward differentiation.
 
     Args:
+      plant: the cart-pole.
       equilibrium: "upright", "hanging", or a State at rest with zero accelerations (at any cart position).
+
+    Returns:
+      The linear model.
 
     Raises:
       InputError: `plant` is no CartPole or has no finite linear model, or `equilibrium` is another word or a concrete

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-import jax
+from jaxtyping import Array, Float
 
 from cpjax.backend.extremes import fast_maximum, fast_minimum
-from cpjax.pytree import Scalar, number, pytree
+from cpjax.pytree import Scalar, Scalars, number, pytree
 
 
 def _at_the_rotor(of_the_cart: float, plant: Any) -> Scalar:
@@ -21,8 +21,8 @@ class Motor:
     F = n k_T i / r - n^2 B_m x' / r^2.
     """
 
-    torque_constant: Scalar = number("N m/A", "torque per current, k_T", default=1.25, above=0.0, uncertain=True)
-    back_emf_constant: Scalar = number(
+    torque_constant: Scalars = number("N m/A", "torque per current, k_T", default=1.25, above=0.0, uncertain=True)
+    back_emf_constant: Scalars = number(
         "V s/rad",
         "voltage per rotor speed, k_V",
         default=1.0,
@@ -31,28 +31,28 @@ class Motor:
         typical=lambda plant: plant.motor.torque_constant,
         drawn=0.0,  # zero back-EMF is an idealised model, not a motor with a small, uncertain back-EMF
     )
-    resistance: Scalar = number("ohm", "resistance of the winding, R", default=1.25, above=0.0, uncertain=True)
-    rotor_inertia: Scalar = number(
+    resistance: Scalars = number("ohm", "resistance of the winding, R", default=1.25, above=0.0, uncertain=True)
+    rotor_inertia: Scalars = number(
         "kg m^2",
         "rotor inertia, J_m",
         default=7e-6,
         at_least=0.0,
         typical=lambda plant: _at_the_rotor(float(plant.cart_mass), plant),
     )
-    viscous_friction: Scalar = number(
+    viscous_friction: Scalars = number(
         "N m s/rad",
         "bearing friction, B_m",
         default=1e-5,
         at_least=0.0,
         typical=lambda plant: _at_the_rotor(float(plant.motor.damping), plant),
     )
-    wheel_radius: Scalar = number("m", "wheel radius, r", default=1.0, above=0.0)
-    gear_ratio: Scalar = number("1", "rotor turns per wheel turn, n", default=1.0, above=0.0)
-    voltage_limit: Scalar = number(
+    wheel_radius: Scalars = number("m", "wheel radius, r", default=1.0, above=0.0)
+    gear_ratio: Scalars = number("1", "rotor turns per wheel turn, n", default=1.0, above=0.0)
+    voltage_limit: Scalars = number(
         "V", "supply: |u| is clipped here", default=12.0, above=0.0, infinite=True, linear=False
     )
 
-    def saturate(self, voltage: Scalar) -> jax.Array:
+    def saturate(self, voltage: Scalar) -> Float[Array, ""]:
         """Clips the demanded voltage [V] to the supply; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
         return fast_maximum(-self.voltage_limit, fast_minimum(self.voltage_limit, voltage))
 

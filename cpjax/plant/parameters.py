@@ -6,7 +6,7 @@ from typing import Any
 
 from cpjax.errors import InputError
 from cpjax.plant.cartpole import CartPole
-from cpjax.pytree import Number, Scalar, numbers
+from cpjax.pytree import Number, Scalars, numbers
 
 
 def parameters_of(plant: CartPole) -> dict[str, Number]:
@@ -14,14 +14,18 @@ def parameters_of(plant: CartPole) -> dict[str, Number]:
     return numbers(type(plant), type(plant.motor))
 
 
-def parameter(plant: CartPole, name: str) -> Scalar:
+def parameter(plant: CartPole, name: str) -> Scalars:
     """Returns the value of a number of the plant or of its motor."""
-    value: Scalar = getattr(plant if name in numbers(type(plant)) else plant.motor, name)
+    value: Scalars = getattr(plant if name in numbers(type(plant)) else plant.motor, name)
     return value
 
 
-def with_parameters(plant: CartPole, values: Mapping[str, Any]) -> CartPole:
+def with_parameters(plant: CartPole, values: Mapping[str, Scalars]) -> CartPole:
     """Returns the plant with some of its or its motor's numbers replaced.
+
+    Args:
+      plant: the plant, which stays as it is.
+      values: the new numbers by name, each in the unit of its declaration.
 
     Raises:
       InputError: a name that neither of them declares, or a concrete value outside its range.
@@ -30,7 +34,7 @@ def with_parameters(plant: CartPole, values: Mapping[str, Any]) -> CartPole:
     for name in values:
         if name not in own and name not in motor:
             raise InputError(name, values[name], "the value of one of " + ", ".join((*own, *motor)))
-    changes = {name: value for name, value in values.items() if name in own}
+    changes: dict[str, Any] = {name: value for name, value in values.items() if name in own}
     others = {name: value for name, value in values.items() if name not in own}
     if others:
         changes["motor"] = dataclasses.replace(plant.motor, **others)

@@ -7,11 +7,11 @@ theta is not wrapped during a simulation; functions that use it modulo a turn sa
 
 import math
 
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from cpjax.numeric.angles import wrap_angle
-from cpjax.pytree import Number, Scalar, pytree
+from cpjax.pytree import Number, Scalars, pytree
 
 NAMES = ("x", "x_dot", "theta", "theta_dot")
 UNITS = ("m", "m/s", "rad", "rad/s")
@@ -31,22 +31,22 @@ class State:
       theta_dot: pole angular velocity [rad/s].
     """
 
-    x: Scalar
-    x_dot: Scalar
-    theta: Scalar
-    theta_dot: Scalar
+    x: Scalars
+    x_dot: Scalars
+    theta: Scalars
+    theta_dot: Scalars
 
-    def vector(self) -> jax.Array:
-        """Returns the state as an array (..., 4) in the order of `NAMES`."""
+    def vector(self) -> Float[Array, "*batch 4"]:
+        """Returns the state as an array in the order of `NAMES`."""
         return jnp.stack([jnp.asarray(getattr(self, name)) for name in NAMES], axis=-1)
 
     @classmethod
-    def from_vector(cls, vector: jax.Array) -> "State":
-        """Builds a state from the last axis of an array (..., 4)."""
+    def from_vector(cls, vector: Float[Array, "*batch 4"]) -> "State":
+        """Builds a state from the last axis of an array, in the order of `NAMES`."""
         return cls(*(vector[..., i] for i in range(4)))
 
 
-def deviation(state: State, reference: State) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+def deviation(state: State, reference: State) -> tuple[Scalars, Scalars, Scalars, Scalars]:
     """Returns `state` minus `reference` in the order of `NAMES`, with the angle difference wrapped to [-pi, pi]."""
     return (
         state.x - reference.x,
