@@ -15,11 +15,11 @@ from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
+from cpjax.show import ANIMATION_FORMATS
 from cpjax.sim.rollout import Trajectory, rollout
 
 CONTROLLERS = ("corrected/lqr", "tuned_lqr")
 _AFTER = 1.0  # simulated beyond the shown time [s]: success must hold that long
-FORMATS = ("gif", "mp4", "html")
 
 OPTIONS = [
     Option(
@@ -29,7 +29,7 @@ OPTIONS = [
         "as-printed/placement (default " + " ".join(CONTROLLERS) + ")",
         count="+",
     ),
-    Option("animation", "format", "(default gif; mp4 needs ffmpeg, and is html without it)", choices=FORMATS),
+    Option("animation", "format", "(default gif; mp4 needs ffmpeg, and is html without it)", choices=ANIMATION_FORMATS),
     Option("animation", "duration", "shown [s] (default 6)", float),
     Option("animation", "rate", "pictures per second, for a GIF at most 50 (default 20)", float),
     *START_OPTIONS,
