@@ -404,7 +404,12 @@ def test_a_step_too_small_for_any_count_of_steps_is_refused():
             "'State with dtypes x: float32, x_dot: float64'",
             "of one dtype, float32 or float64, throughout",
         ),
-        (State(np.ones(1), 0.0, 0.0, 0.0), "start.x", "'array of shape (1,)'", "one number; many initial states go through"),
+        (
+            State(np.ones(1), 0.0, 0.0, 0.0),
+            "start.x",
+            "'array of shape (1,)'",
+            "one number; many initial states go through",
+        ),
         (
             State(0.0, 0.0, np.ones(3), 0.0),
             "start.theta",
