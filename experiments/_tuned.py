@@ -12,7 +12,7 @@ from cpjax import files, io
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
-from cpjax.sim.metrics import Fold, Metrics
+from cpjax.sim.metrics import Metric, Metrics
 from cpjax.sim.sweep import sweep
 from cpjax.tune.config import TuningConfig
 from cpjax.tune.outcome import document, request
@@ -35,7 +35,7 @@ QUICK: dict[str, Any] = {
 
 
 def located_rate(
-    plant: CartPole, controller: Hybrid, starts: State, duration: float, metrics: Fold | None = None
+    plant: CartPole, controller: Hybrid, starts: State, duration: float, metrics: Metric | None = None
 ) -> tuple[float, float]:
     """Of the first fifth of `starts`, on the continuous clock with located switching: the share that succeeds, and the
     successes' mean settling time [s].

@@ -46,7 +46,7 @@ MOVE = 1e-3
 class Counted:
     """Folds the time outside the target and the number of mode changes."""
 
-    outside: cpjax.TimeOutside = cpjax.pytree.part("a fold", "init", "update", "finish", default=cpjax.TimeOutside())
+    outside: cpjax.TimeOutside = cpjax.pytree.part("a metric", "init", "update", default=cpjax.TimeOutside())
 
     def init(self, sample: Sample) -> Any:
         return self.outside.init(sample), jnp.zeros_like(sample.mode)
@@ -55,8 +55,8 @@ class Counted:
         changes = memory[1] + (sample.mode != sample.mode_before).astype(memory[1].dtype)
         return self.outside.update(memory[0], sample), changes
 
-    def finish(self, memory: Any, last: Sample) -> Any:
-        return self.outside.finish(memory[0], last), memory[1], last.flag
+    def finalize(self, memory: Any, last: Sample) -> Any:
+        return self.outside.finalize(memory[0], last), memory[1], last.flag
 
 
 class Loop:

@@ -55,9 +55,9 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
             plan = TuningConfig(seed=number, goal=goal, **((FURTHER if further else FREELY) | (QUICK if quick else {})))
             tunings.append((number, *tuned(out, f"{limit:g}m-{design}-{number}", plant, free, plan)))
         number, controller, made = min(tunings, key=lambda tuning: float(tuning[2]["score"]))
-        fold = ProtocolMetrics(track_limit=limit)
-        found = summarise(sweep(plant, controller, starts, duration=10.0, dt=0.002, clock="sampled", metrics=fold))
-        located, _ = located_rate(plant, controller, starts, duration=10.0, metrics=fold)
+        metric = ProtocolMetrics(track_limit=limit)
+        found = summarise(sweep(plant, controller, starts, duration=10.0, dt=0.002, clock="sampled", metrics=metric))
+        located, _ = located_rate(plant, controller, starts, duration=10.0, metrics=metric)
         row = {"track_limit": limit, "design": design, "seed": number, "evaluation": found, "located_rate": located}
         row |= {key: made[key] for key in ("labels", "physical", "value_steps", "gradient_steps", "seconds")}
         rows.append(row | {"scores": [one["score"] for _, _, one in tunings]})

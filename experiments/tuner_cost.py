@@ -95,9 +95,11 @@ def _measure(design: Any, work: str, quick: bool) -> float:
         return jnp.where(found.success, found.settling_time, duration)
 
     def outside(vector: jax.Array, start: State) -> jax.Array:
-        fold = TimeOutside(0.1, 0.1)
+        metric = TimeOutside(0.1, 0.1)
         settings: dict[str, Any] = {"switching": "located", "spare_steps": plan.spare_steps}
-        found: jax.Array = measure(plant, free.build(vector), start, duration=duration, dt=dt, metrics=fold, **settings)
+        found: jax.Array = measure(
+            plant, free.build(vector), start, duration=duration, dt=dt, metrics=metric, **settings
+        )
         return found
 
     function: Any = value if work == "values" else jax.value_and_grad(outside)

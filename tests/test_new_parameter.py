@@ -252,8 +252,8 @@ np.testing.assert_allclose(found, plain.vector_field(cpjax.State(*state), 2.0 - 
 # Rollouts
 start = cpjax.State(0.0, 1.0, 3.0, 0.0)
 run = dict(duration=0.1, dt=0.002, clock="sampled")  # as the command above: compiled already
-fold = cpjax.ProtocolMetrics(reference_x=0.0)
-slowed, free = (cpjax.rollout(plant, controller, start, metrics=fold, **run).state for plant in (rubbing, plain))
+metric = cpjax.ProtocolMetrics(reference_x=0.0)
+slowed, free = (cpjax.rollout(plant, controller, start, metrics=metric, **run).state for plant in (rubbing, plain))
 assert slowed.x[-1] < free.x[-1] - 5e-4
 starts = jax.tree.map(lambda v: np.array([v, v]), start)
 swept = cpjax.sweep(rubbing, controller, starts, **run)

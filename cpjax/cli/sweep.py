@@ -55,7 +55,7 @@ def run(given: argparse.Namespace) -> int:
     starts = sample_starts(name, count, seed=given.seed, dtype=np.dtype(chosen["precision"]))
     save_every = chosen.get("save_every")
     path = given.out / ("trajectories" if save_every is not None else f"metrics.{chosen['format']}")
-    fold = ProtocolMetrics(reference_x=sections["controller"].get("reference_x", 0.0))
+    metric = ProtocolMetrics(reference_x=sections["controller"].get("reference_x", 0.0))
     begin = time.perf_counter()
     with progress("sweep") as report:
 
@@ -70,7 +70,7 @@ def run(given: argparse.Namespace) -> int:
             starts,
             **setting,
             clock="sampled",
-            metrics=fold,
+            metrics=metric,
             save_every=save_every,
             about={"starts": name, "seed": given.seed},
             progress=tell,

@@ -58,8 +58,8 @@ def run(given: argparse.Namespace) -> int:
     start = build_start(sections["start"], given.seed)
     settings = {"duration": 20.0, "dt": 0.002, "clock": "sampled", **sections["run"]}
     try:
-        fold = ProtocolMetrics(reference_x=sections["controller"].get("reference_x", 0.0))
-        trajectory = rollout(plant, controller, start, metrics=fold, **settings)
+        metric = ProtocolMetrics(reference_x=sections["controller"].get("reference_x", 0.0))
+        trajectory = rollout(plant, controller, start, metrics=metric, **settings)
     except InputError as problem:
         raise InputError(problem.field.replace("start.", "start "), problem.value, problem.allowed) from problem
     metrics = trajectory.metrics
@@ -92,7 +92,7 @@ def run(given: argparse.Namespace) -> int:
     save_figure(picture, response(trajectory, _title(metrics), until, float(plant.motor.voltage_limit)))
     _print(metrics)
     if not bool(metrics.success):
-        say("why: " + reason(trajectory, fold, hybrid=isinstance(controller, Hybrid)))
+        say("why: " + reason(trajectory, metric, hybrid=isinstance(controller, Hybrid)))
     say(f"wrote {path} and {picture}")
     return 0 if bool(metrics.success) else 1
 
@@ -117,12 +117,12 @@ def _print(metrics: Metrics) -> None:
     Console().print(table)
 
 
-def reason(run: Trajectory, fold: ProtocolMetrics, *, hybrid: bool) -> str:
+def reason(run: Trajectory, metric: ProtocolMetrics, *, hybrid: bool) -> str:
     """Says why a run does not count as settled, as far as its trajectory shows.
 
     Args:
       run: with every step saved.
-      fold: the metric that did not count it as settled.
+      metric: the metric that did not count it as settled.
       hybrid: whether the controller has a gate.
     """
     flag, end = int(run.flag), float(run.time[-1])
@@ -142,13 +142,13 @@ def reason(run: Trajectory, fold: ProtocolMetrics, *, hybrid: bool) -> str:
         times = "once" if entries == 1 else f"{entries} times"
         return f"the pendulum reached the gate {times}, and each time left it again"
     acts = f"the regulator acts since {float(run.time[_first_of_the_last(acting)]):.3g} s, but " if hybrid else ""
-    angle, away = abs(math.remainder(theta, math.tau)), abs(x - float(fold.reference_x))
+    angle, away = abs(math.remainder(theta, math.tau)), abs(x - float(metric.reference_x))
     if math.isfinite(float(run.metrics.settling_time)):
         since = end - float(run.metrics.settling_time)
-        return f"{acts}the run ended {since:.2g} s after it had settled, and {float(fold.hold):g} s are asked for"
+        return f"{acts}the run ended {since:.2g} s after it had settled, and {float(metric.hold):g} s are asked for"
     return (
         f"{acts}at the end, after {end:g} s, the angle is {angle:.3g} rad and the cart {away:.3g} m away; settled is "
-        f"within {float(fold.angle_band):g} rad and {float(fold.position_band):g} m"
+        f"within {float(metric.angle_band):g} rad and {float(metric.position_band):g} m"
     )
 
 

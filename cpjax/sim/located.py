@@ -21,8 +21,8 @@ from cpjax.sim.closed_loop import GATE_CROSSING, ContinuousLoop, HeldLoop, HeldM
 from cpjax.sim.control import Control, start_control, update_control
 from cpjax.sim.flags import CHATTER_LENGTH, Flag, nonfinite_flag, nonfinite_input
 from cpjax.sim.integrators import INTEGRATORS, Integrator, Step
-from cpjax.sim.metrics import Fold, MetricState, Sample
-from cpjax.sim.per_step import finish_metric, sees_the_voltage, start_metric, update_metric
+from cpjax.sim.metrics import Metric, MetricState, Sample
+from cpjax.sim.per_step import finalize_metric, sees_the_voltage, start_metric, update_metric
 from cpjax.sim.plants import Plant, PlantState
 from cpjax.sim.saved import pack
 from cpjax.sim.scan import scan
@@ -49,7 +49,7 @@ _Carry: TypeAlias = tuple[_Loop, MetricState]
 
 
 def simulate(
-    start: PlantState, plant: Plant, controller: Any, fold: Fold, dt: Step, settings: Settings
+    start: PlantState, plant: Plant, controller: Any, metric: Metric, dt: Step, settings: Settings
 ) -> tuple[Float[Array, "rows columns"] | None, Sample, Any]:
     """Simulates one initial state; see `cpjax.sim.rollout.simulate`."""
     q, v = plants.coordinates(plant, start)
@@ -68,14 +68,14 @@ def simulate(
     motion = start_motion(system, q, v, mode, dt)
     loop = _Loop(motion, flag, motion.seen.output, _law(motion, control), control, jnp.zeros_like(flag))
     first = _sample(plant, loop, motion, dt)
-    started = start_metric(fold, first)
-    if settings.derivative == "mean" and sees_the_voltage(fold, started, first):
+    started = start_metric(metric, first)
+    if settings.derivative == "mean" and sees_the_voltage(metric, started, first):
         allowed = "pathwise, for a plant with events and a metric that depends on the voltage"
         raise InputError("derivative", "mean", allowed)
 
     run = single_kernel(functools.partial(_run, settings=settings), stacks=True)
-    carry = (loop, update_metric(fold, started, first))
-    carry, kept = run(carry, plant, controller, fold, dt)
+    carry = (loop, update_metric(metric, started, first))
+    carry, kept = run(carry, plant, controller, metric, dt)
     loop, memory = carry
     last = _sample(plant, loop, loop.motion, dt)
     last = last._replace(flag=last.flag | nonfinite_input(last.voltage))
@@ -86,11 +86,11 @@ def simulate(
         wanted = jnp.arange(settings.save_every, settings.steps, settings.save_every, dtype=passed.dtype)
         rows = jnp.searchsorted(passed, wanted)
         samples = jnp.concatenate([pack(first)[None], samples[rows]])
-    return samples, last, finish_metric(fold, memory, last)
+    return samples, last, finalize_metric(metric, memory, last)
 
 
 def _run(
-    carry: _Carry, plant: Plant, controller: Any, fold: Fold, dt: Step, settings: Settings
+    carry: _Carry, plant: Plant, controller: Any, metric: Metric, dt: Step, settings: Settings
 ) -> tuple[_Carry, tuple[Float[Array, "iterations columns"], Int[Array, " iterations"]] | None]:
     """Returns loop and metric state after all iterations and, if samples are saved, the packed sample of each iteration
     with the number of grid points passed."""
@@ -102,7 +102,7 @@ def _run(
         before, memory = carry
         loop, reached = _advance(plant, controller, before, dt, settings, iterations - index)
         sample = _sample(plant, loop, before.motion, dt)
-        after = outline(update_metric)(fold, memory, sample)
+        after = outline(update_metric)(metric, memory, sample)
         updated = after, sample.voltage, sample.mode
         kept = memory, loop.voltage, loop.mode
         memory, voltage, mode = jax.tree.map(lambda new, old: jnp.where(reached, new, old), updated, kept)

@@ -1,8 +1,8 @@
 """Metrics of a rollout, computed while it runs.
 
 A metric is a streaming reduction over the rollout's samples: `init` with the first sample, `update` with each sample
-(the first one included, at `elapsed = 0`), `finish` with the last. The trajectory need not be stored for it, so a
-million initial states fit in memory.
+(the first one included, at `elapsed = 0`), `finalize` with the last. The trajectory need not be stored for it, so a
+million initial states fit in state.
 """
 
 import math
@@ -71,20 +71,34 @@ class Sample(NamedTuple):
 
 
 @runtime_checkable
-class Fold(Protocol):
+class Metric(Protocol):
     """Interface of a metric, a streaming reduction over samples. A pytree: its numbers may be traced."""
 
     def init(self, sample: Sample) -> MetricState:
         """Returns the metric state before the first update: any pytree of arrays."""
         ...
 
-    def update(self, memory: MetricState, sample: Sample) -> MetricState:
+    def update(self, state: MetricState, sample: Sample) -> MetricState:
         """Returns the metric state after `sample`, of the same structure, shapes and dtypes."""
         ...
 
-    def finish(self, memory: MetricState, last: Sample) -> Any:
+    def finalize(self, state: MetricState, last: Sample) -> Any:
         """Returns the result from the final metric state and the last sample."""
         ...
+
+
+Fold = Metric
+"""The name until version 0.1."""
+
+
+def finalize(metric: Metric, state: MetricState, last: Sample) -> Any:
+    """Returns a metric's result from its final state and the last sample."""
+    return getattr(metric, finalize_name(metric))(state, last)
+
+
+def finalize_name(metric: Metric) -> str:
+    """Returns the name of the method that gives a metric's result, which was `finish` until version 0.1."""
+    return "finalize" if hasattr(metric, "finalize") else "finish"
 
 
 Integral: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]
@@ -98,10 +112,10 @@ class NoMetrics:
     def init(self, sample: Sample) -> tuple[()]:
         return ()
 
-    def update(self, memory: tuple[()], sample: Sample) -> tuple[()]:
+    def update(self, state: tuple[()], sample: Sample) -> tuple[()]:
         return ()
 
-    def finish(self, memory: tuple[()], last: Sample) -> None:
+    def finalize(self, state: tuple[()], last: Sample) -> None:
         return None
 
 
@@ -149,13 +163,13 @@ class TimeOutside:
     def init(self, sample: Sample) -> Integral:
         return jnp.zeros_like(sample.time), self._outside(sample)
 
-    def update(self, memory: Integral, sample: Sample) -> Integral:
-        total, before = memory
+    def update(self, state: Integral, sample: Sample) -> Integral:
+        total, before = state
         now = self._outside(sample)
         return total + 0.5 * sample.elapsed * (before + now), now
 
-    def finish(self, memory: Integral, last: Sample) -> Float[Array, ""]:
-        return memory[0]
+    def finalize(self, state: Integral, last: Sample) -> Float[Array, ""]:
+        return state[0]
 
     def _outside(self, sample: Sample) -> Float[Array, ""]:
         _, cos = sin_cos(sample.state.theta)
@@ -163,7 +177,7 @@ class TimeOutside:
         return 1.0 - jnp.exp(-(1.0 - cos) / (self.angle_width * self.angle_width) - 0.5 * away * away)
 
 
-class _Memory(NamedTuple):
+class _State(NamedTuple):
     entered: Float[Array, ""]
     cart_travel: Float[Array, ""]
     effort: Float[Array, ""]
@@ -183,9 +197,9 @@ class ProtocolMetrics:
     reference_x: Scalar = number("m", "where the cart is to settle", default=0.0)
     track_limit: Scalar = number("m", "success: |x| never beyond", default=math.inf, above=0.0, infinite=True)
 
-    def init(self, sample: Sample) -> _Memory:
+    def init(self, sample: Sample) -> _State:
         nothing = jnp.zeros_like(sample.voltage)
-        return _Memory(
+        return _State(
             entered=jnp.full_like(sample.voltage, math.inf),
             cart_travel=nothing,
             effort=nothing,
@@ -195,7 +209,7 @@ class ProtocolMetrics:
             switches=jnp.zeros_like(sample.mode),
         )
 
-    def update(self, memory: _Memory, sample: Sample) -> _Memory:
+    def update(self, state: _State, sample: Sample) -> _State:
         travel = jnp.abs(sample.state.x)
         away = jnp.abs(sample.state.x - self.reference_x)
         inside = (jnp.abs(wrap_angle(sample.state.theta)) <= self.angle_band) & (away <= self.position_band)
@@ -206,29 +220,29 @@ class ProtocolMetrics:
         if last is not None:
             variation = variation + jnp.abs(last - first)
             effort = 0.5 * (effort + sample.elapsed * last * last)
-        return _Memory(
-            entered=jnp.where(inside, fast_minimum(sample.time, memory.entered), math.inf),
-            cart_travel=fast_maximum(memory.cart_travel, travel),
-            effort=memory.effort + effort,
-            voltage_variation=memory.voltage_variation + variation,
-            peak_voltage=fast_maximum(memory.peak_voltage, jnp.abs(sample.voltage)),
-            peak_cart_acceleration=fast_maximum(memory.peak_cart_acceleration, jnp.abs(sample.cart_acceleration)),
-            switches=memory.switches + (sample.mode != sample.mode_before).astype(memory.switches.dtype),
+        return _State(
+            entered=jnp.where(inside, fast_minimum(sample.time, state.entered), math.inf),
+            cart_travel=fast_maximum(state.cart_travel, travel),
+            effort=state.effort + effort,
+            voltage_variation=state.voltage_variation + variation,
+            peak_voltage=fast_maximum(state.peak_voltage, jnp.abs(sample.voltage)),
+            peak_cart_acceleration=fast_maximum(state.peak_cart_acceleration, jnp.abs(sample.cart_acceleration)),
+            switches=state.switches + (sample.mode != sample.mode_before).astype(state.switches.dtype),
         )
 
-    def finish(self, memory: _Memory, last: Sample) -> Metrics:
+    def finalize(self, state: _State, last: Sample) -> Metrics:
         stopped = (last.flag & STOPPED) != 0
-        settling_time = jnp.where(stopped, math.inf, memory.entered)
+        settling_time = jnp.where(stopped, math.inf, state.entered)
         rounding = 64.0 * float(np.finfo(last.time.dtype).eps) * last.time
         in_time = settling_time <= last.time - self.hold + rounding
         return Metrics(
-            success=in_time & (memory.cart_travel <= self.track_limit),
+            success=in_time & (state.cart_travel <= self.track_limit),
             settling_time=settling_time,
-            cart_travel=memory.cart_travel,
-            effort=memory.effort,
-            voltage_variation=memory.voltage_variation,
-            peak_voltage=memory.peak_voltage,
-            peak_cart_acceleration=memory.peak_cart_acceleration,
-            switches=memory.switches,
+            cart_travel=state.cart_travel,
+            effort=state.effort,
+            voltage_variation=state.voltage_variation,
+            peak_voltage=state.peak_voltage,
+            peak_cart_acceleration=state.peak_cart_acceleration,
+            switches=state.switches,
             flag=last.flag,
         )

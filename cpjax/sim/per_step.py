@@ -23,7 +23,7 @@ from cpjax.sim.control import Control, start_control, update_control
 from cpjax.sim.derivatives import shifted, warn_of_memory
 from cpjax.sim.flags import CHATTER_LENGTH, NEEDS_RECOMPUTE, Flag, nonfinite_flag, nonfinite_input
 from cpjax.sim.integrators import INTEGRATORS, Step
-from cpjax.sim.metrics import Fold, MetricState, Sample
+from cpjax.sim.metrics import Metric, MetricState, Sample, finalize_name
 from cpjax.sim.plants import Plant, PlantState, Tree
 from cpjax.sim.saved import pack
 from cpjax.sim.scan import scan
@@ -52,7 +52,7 @@ _Carry: TypeAlias = tuple[_Loop, MetricState]
 
 
 def simulate(
-    start: PlantState, plant: Plant, controller: Any, fold: Fold, dt: Step, settings: Settings
+    start: PlantState, plant: Plant, controller: Any, metric: Metric, dt: Step, settings: Settings
 ) -> tuple[Float[Array, "rows columns"] | None, Sample, Any]:
     """Simulates one initial state; see `cpjax.sim.rollout.simulate`."""
     control = start_control(plant, controller, start, settings)
@@ -61,25 +61,25 @@ def simulate(
     loop = _Loop(start, control, flag, jnp.zeros_like(flag))
     _, first, _ = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
 
-    started = start_metric(fold, first)
-    if control.blend is not None and control.blend.memory_echo and sees_the_voltage(fold, started, first):
+    started = start_metric(metric, first)
+    if control.blend is not None and control.blend.memory_echo and sees_the_voltage(metric, started, first):
         warn_of_memory()
     carry = (loop, started)
     run = single_kernel(functools.partial(_run, settings=settings), stacks=True)
-    (loop, memory), samples = run(carry, plant, controller, fold, dt)
+    (loop, memory), samples = run(carry, plant, controller, metric, dt)
     after, last, _ = _observe(plant, controller, loop, jnp.asarray(settings.steps), dt, settings)
     broken = nonfinite_input(last.voltage)  # of the last instant, after which no step looks at it
     broken = jnp.where(broken != 0, np.int32(NEEDS_RECOMPUTE), broken) if settings.fast_path else broken
     last = last._replace(flag=last.flag | broken)
     clean = last._replace(flag=last.flag & ~NEEDS_RECOMPUTE)
     memory = _fold(
-        fold, memory, clean, plant, loop.control, after.control, jnp.asarray(settings.steps), settings, update_metric
+        metric, memory, clean, plant, loop.control, after.control, jnp.asarray(settings.steps), settings, update_metric
     )
-    return samples, _saved(plant, last, after), finish_metric(fold, memory, clean)
+    return samples, _saved(plant, last, after), finalize_metric(metric, memory, clean)
 
 
 def _run(
-    carry: _Carry, plant: Plant, controller: Any, fold: Fold, dt: Step, settings: Settings
+    carry: _Carry, plant: Plant, controller: Any, metric: Metric, dt: Step, settings: Settings
 ) -> tuple[_Carry, Float[Array, "rows columns"] | None]:
     """Returns loop and metric state after all steps, and the saved samples except the last."""
     steps, every = settings.steps, settings.save_every
@@ -88,7 +88,7 @@ def _run(
         before, memory = carry
         loop, sample, instant = _observe(plant, controller, before, index, dt, settings)
         memory = _fold(
-            fold, memory, sample, plant, before.control, loop.control, index, settings, outline(update_metric)
+            metric, memory, sample, plant, before.control, loop.control, index, settings, outline(update_metric)
         )
         saved = pack(_saved(plant, sample, loop)) if every == 1 else None
         return (_advance(plant, controller, loop, instant, dt, settings), memory), saved
@@ -108,7 +108,7 @@ def _run(
 
 
 def _fold(
-    fold: Fold,
+    metric: Metric,
     memory: MetricState,
     sample: Sample,
     plant: Plant,
@@ -119,8 +119,8 @@ def _fold(
     update: Callable[..., MetricState],
 ) -> MetricState:
     """Returns the metric state after a sample, with the derivative of the mean if that is requested."""
-    new = update(fold, memory, sample)
-    if now.blend is None or before.blend is None or not sees_the_voltage(fold, memory, sample):
+    new = update(metric, memory, sample)
+    if now.blend is None or before.blend is None or not sees_the_voltage(metric, memory, sample):
         return new
     # A metric need not be linear in the voltage, so it is also computed with the other voltage: with that of the
     # previous period, still applied unless this is a control instant, and with that of the period that begins.
@@ -131,17 +131,17 @@ def _fold(
         mode_before=jnp.where(instant, before.blend.mode, now.blend.mode),
         mode=jnp.where(instant, sample.mode, now.blend.mode),
     )
-    result = shifted(new, update(fold, memory, _completed(plant, since)), before.blend.shift)
+    result = shifted(new, update(metric, memory, _completed(plant, since)), before.blend.shift)
     begun = sample._replace(voltage=now.blend.held, mode=now.blend.mode)
-    return shifted(result, update(fold, memory, _completed(plant, begun)), jnp.where(instant, now.blend.shift, 0.0))
+    return shifted(result, update(metric, memory, _completed(plant, begun)), jnp.where(instant, now.blend.shift, 0.0))
 
 
-def sees_the_voltage(fold: Fold, memory: MetricState, sample: Sample) -> bool:
+def sees_the_voltage(metric: Metric, memory: MetricState, sample: Sample) -> bool:
     """Returns whether a metric's update may depend on the voltage or the mode, also through the plant's outputs."""
 
     def update(voltages: Any) -> Any:
         names = ("voltage", "voltage_since", "outputs", "mode", "mode_before")
-        return update_metric(fold, memory, sample._replace(**dict(zip(names, voltages, strict=True))))
+        return update_metric(metric, memory, sample._replace(**dict(zip(names, voltages, strict=True))))
 
     given = sample.voltage, sample.voltage_since, sample.outputs, sample.mode, sample.mode_before
     jaxpr = jax.make_jaxpr(update)(given).jaxpr
@@ -164,21 +164,22 @@ def _saved(plant: Plant, sample: Sample, loop: _Loop) -> Sample:
     return sample if loop.control.blend is None else _completed(plant, sample._replace(voltage=loop.control.applied))
 
 
-def update_metric(fold: Fold, memory: MetricState, sample: Sample) -> MetricState:
+def update_metric(metric: Metric, memory: MetricState, sample: Sample) -> MetricState:
     """Returns a metric's state after a sample."""
-    updated = cast(arrays("metrics.update", call("metrics", fold, "update", memory, sample)), sample.time.dtype)
+    updated = cast(arrays("metrics.update", call("metrics", metric, "update", memory, sample)), sample.time.dtype)
     return like("metrics.update", updated, memory)
 
 
-def start_metric(fold: Fold, first: Sample) -> MetricState:
+def start_metric(metric: Metric, first: Sample) -> MetricState:
     """Returns a metric's state before its first update, in the rollout's dtype."""
-    begun = arrays("metrics.init", call("metrics", fold, "init", first))
+    begun = arrays("metrics.init", call("metrics", metric, "init", first))
     return jax.tree.map(jnp.asarray, cast(begun, first.time.dtype))
 
 
-def finish_metric(fold: Fold, memory: MetricState, last: Sample) -> Any:
+def finalize_metric(metric: Metric, memory: MetricState, last: Sample) -> Any:
     """Returns the result of a metric."""
-    return arrays("metrics.finish", call("metrics", fold, "finish", memory, last), keys=False)
+    name = finalize_name(metric)
+    return arrays(f"metrics.{name}", call("metrics", metric, name, memory, last), keys=False)
 
 
 def _observe(

@@ -5,6 +5,7 @@ computation: that of `per_step.py` or that of `located.py`.
 """
 
 import functools
+import warnings
 from typing import Any, Unpack
 
 import jax
@@ -29,7 +30,7 @@ from cpjax.sim.derivatives import may_switch, watched
 from cpjax.sim.flags import NEEDS_RECOMPUTE
 from cpjax.sim.initial import checked_initial
 from cpjax.sim.integrators import Step
-from cpjax.sim.metrics import Fold, NoMetrics, ProtocolMetrics, Sample
+from cpjax.sim.metrics import Metric, NoMetrics, ProtocolMetrics, Sample
 from cpjax.sim.plants import Plant, PlantState, check_plant, has_events
 from cpjax.sim.saved import SavedSamples, fields, keep
 from cpjax.sim.settings import Settings, Simulation, check_names, check_settings
@@ -69,7 +70,7 @@ def rollout(
     controller: Controller | ModalController | Law,
     start: PlantState,
     *,
-    metrics: Fold | None = None,
+    metrics: Metric | None = None,
     **simulation: Unpack[Simulation],
 ) -> Trajectory:
     """Simulates the closed loop from one initial state. Works under `jit`, `vmap` and differentiation.
@@ -106,7 +107,7 @@ def measure(
     controller: Controller | ModalController | Law,
     start: PlantState,
     *,
-    metrics: Fold | None = None,
+    metrics: Metric | None = None,
     **simulation: Unpack[Simulation],
 ) -> Any:
     """Simulates as `rollout` does and returns only the metric's result, without storing a trajectory.
@@ -122,8 +123,8 @@ def measure(
 
 
 def prepared(
-    plant: Any, controller: Any, start: PlantState, metrics: Fold | None, *, batched: bool = False, **simulation: Any
-) -> tuple[PlantState, tuple[Plant, Any, Fold, Step], Settings, list[bool]]:
+    plant: Any, controller: Any, start: PlantState, metrics: Metric | None, *, batched: bool = False, **simulation: Any
+) -> tuple[PlantState, tuple[Plant, Any, Metric, Step], Settings, list[bool]]:
     """Checks the arguments of `simulate` and casts them to the initial state's dtype.
 
     Args:
@@ -155,9 +156,12 @@ def prepared(
         if not isinstance(plant, CartPole) and settings.save_every is None:
             raise InputError("metrics", None, "given: the default ProtocolMetrics() are those of a cpjax.CartPole")
         metrics = default_metrics(plant)
-    folds = all(callable(getattr(metrics, name, None)) for name in ("init", "update", "finish"))
-    if isinstance(metrics, type) or not folds:
-        raise InputError("metrics", metrics, "a metric with init, update and finish, such as cpjax.ProtocolMetrics()")
+    present = {name for name in ("init", "update", "finalize", "finish") if callable(getattr(metrics, name, None))}
+    if isinstance(metrics, type) or not present >= {"init", "update"} or not present & {"finalize", "finish"}:
+        raise InputError("metrics", metrics, "a metric with init, update and finalize, such as cpjax.ProtocolMetrics()")
+    if "finalize" not in present:
+        message = f"{type(metrics).__name__}.finish is now called finalize; the old name goes with version 0.3"
+        warnings.warn(message, DeprecationWarning, stacklevel=3)
     parts: tuple[tuple[str, Any], ...] = (("plant", plant), ("controller", controller), ("metrics", metrics))
     each = [leaf for name, part in parts for leaf in check(name, part, count)]
     plant, controller, metrics = (as_arguments(name, part, dtype) for name, part in parts)
@@ -165,18 +169,18 @@ def prepared(
     return start, (plant, controller, metrics, dt), settings, [*each, False]
 
 
-def default_metrics(plant: Any) -> Fold:
+def default_metrics(plant: Any) -> Metric:
     """Returns the default metric of a rollout: `ProtocolMetrics()` for a `CartPole`, `NoMetrics()` for other plants."""
     return ProtocolMetrics() if isinstance(plant, CartPole) else NoMetrics()
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def _simulate(start: PlantState, plant: Plant, controller: Any, fold: Fold, dt: Step, *, settings: Settings) -> Any:
-    return results(*simulate(start, plant, controller, fold, dt, settings))
+def _simulate(start: PlantState, plant: Plant, controller: Any, metric: Metric, dt: Step, *, settings: Settings) -> Any:
+    return results(*simulate(start, plant, controller, metric, dt, settings))
 
 
 def simulate(
-    start: PlantState, plant: Any, controller: Any, fold: Any, dt: Step, settings: Settings
+    start: PlantState, plant: Any, controller: Any, metric: Any, dt: Step, settings: Settings
 ) -> tuple[SavedSamples | None, Sample, Any]:
     """Simulates one initial state; arguments as `prepared` returns them.
 
@@ -184,14 +188,14 @@ def simulate(
       The saved samples except the final one (None if nothing is saved), the final sample (its flag may have
       NEEDS_RECOMPUTE), and the metric's result.
     """
-    plant, controller, fold = reveal((plant, controller, fold))
+    plant, controller, metric = reveal((plant, controller, metric))
     if settings.clock == "sampled":
         controller = at_period(controller, dt * settings.steps_per_control)
     blind = settings.switching == "per_step" or settings.clock == "sampled"
     if blind and settings.derivative is None and may_switch(controller, start):
         start, plant, controller = watched((start, plant, controller))
     one = located.simulate if settings.switching == "located" else per_step.simulate
-    packed, last, result = one(start, plant, controller, fold, dt, settings)
+    packed, last, result = one(start, plant, controller, metric, dt, settings)
     return (None if packed is None else keep(packed, plant, last)), last, result
 
 

@@ -24,7 +24,7 @@ from cpjax.errors import InputError
 from cpjax.pytree import is_traced
 from cpjax.sim.flags import NEEDS_RECOMPUTE
 from cpjax.sim.initial import component_names
-from cpjax.sim.metrics import Fold, Sample
+from cpjax.sim.metrics import Metric, Sample
 from cpjax.sim.plants import Plant, PlantState
 from cpjax.sim.rollout import prepared, results, simulate
 from cpjax.sim.saved import SavedSamples
@@ -59,7 +59,7 @@ def sweep(
     controller: Controller | ModalController | Law,
     starts: PlantState,
     *,
-    metrics: Fold | None = None,
+    metrics: Metric | None = None,
     chunk: int | None = None,
     block: int | None = None,
     progress: Progress | None = None,
@@ -109,7 +109,7 @@ class _CompileKey(NamedTuple):
     """Static arguments of a compilation, beside shapes and dtypes."""
 
     structure: Any
-    """Tree structure of (start, (plant, controller, fold, dt))."""
+    """Tree structure of (start, (plant, controller, metric, dt))."""
     batched: tuple[bool, ...]
     """Whether each leaf of that structure has one entry per initial state."""
     settings: Settings
@@ -197,7 +197,7 @@ def prepare(
     controller: Controller | ModalController | Law,
     starts: PlantState,
     *,
-    metrics: Fold | None,
+    metrics: Metric | None,
     chunk: int | None,
     block: int | None,
     **simulation: Any,
@@ -247,8 +247,8 @@ def _one(column: list[Any], shared: list[Any], kind: _CompileKey) -> tuple[Saved
     """Returns the result of `simulate` for one initial state."""
     columns, others = iter(column), iter(shared)
     leaves = [next(columns) if many else next(others) for many in kind.batched]
-    start, (plant, controller, fold, dt) = jax.tree.unflatten(kind.structure, leaves)
-    return simulate(start, plant, controller, fold, dt, kind.settings)
+    start, (plant, controller, metric, dt) = jax.tree.unflatten(kind.structure, leaves)
+    return simulate(start, plant, controller, metric, dt, kind.settings)
 
 
 _Forms: TypeAlias = tuple[tuple[tuple[int, ...], str], ...]

@@ -26,7 +26,7 @@ from cpjax.plant.state import NAMES, State
 from cpjax.pytree import Scalar, is_traced
 from cpjax.sim.flags import STOPPED, describe
 from cpjax.sim.initial import checked_initial
-from cpjax.sim.metrics import Fold, TimeOutside
+from cpjax.sim.metrics import Metric, TimeOutside
 from cpjax.sim.rollout import measure
 from cpjax.sim.settings import Switching, check_settings
 from cpjax.study.gradient_probe import HorizonRecorder, Probe
@@ -167,7 +167,7 @@ def audit_gradients(
     duration: float = 4.0,
     dt: float = 1e-3,
     horizons: Sequence[float] | None = None,
-    objective: Fold | None = None,
+    objective: Metric | None = None,
     scales: Mapping[str, float] | None = None,
     temperatures: Sequence[float] = (0.1, 0.01),
     each: bool = False,
@@ -204,7 +204,7 @@ def audit_gradients(
     n = int(jnp.shape(starts.x)[0])
     names, x, shapes = as_matrix(parameters, n, each)
     scale = parameter_scales(names, x, scales or {})
-    fold = HorizonRecorder(
+    metric = HorizonRecorder(
         TimeOutside() if objective is None else objective, jnp.asarray(ends + 0.25 * dt, dtype), jnp.asarray(dt, dtype)
     )
 
@@ -227,7 +227,7 @@ def audit_gradients(
         how: dict[str, Any] = {"duration": duration, "dt": dt, "clock": "continuous", "switching": switching}
         if switching == "per_step":
             how["derivative"] = "pathwise"  # its error is what the audit measures
-        found: tuple[Probe, Int[Array, ""]] = measure(plant, law, start, metrics=fold, **how)
+        found: tuple[Probe, Int[Array, ""]] = measure(plant, law, start, metrics=metric, **how)
         return found
 
     def jacobians(switching: Switching, arguments: tuple[int, ...]) -> Any:

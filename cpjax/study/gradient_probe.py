@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from cpjax.pytree import part, pytree
 from cpjax.sim.closed_loop import GATE_CROSSING
-from cpjax.sim.metrics import Fold, MetricState, Sample
+from cpjax.sim.metrics import Metric, MetricState, Sample, finalize
 
 
 class Probe(NamedTuple):
@@ -27,7 +27,7 @@ class Probe(NamedTuple):
     count because the samples' states, and sums over them, have a (small) kink where a crossing passes a sample."""
 
 
-class _Memory(NamedTuple):
+class _State(NamedTuple):
     objective: MetricState
     crossings: Int[Array, ""]
     speed: Float[Array, ""]
@@ -39,13 +39,13 @@ class _Memory(NamedTuple):
 class HorizonRecorder:
     """Metric that records an objective, the state and the crossings at several horizons."""
 
-    objective: Fold = part("a fold", "init", "update", "finish")
+    objective: Metric = part("a metric", "init", "update")
     horizons: Float[Array, " horizons"]
     """Times of the records [s]."""
     dt: Float[Array, ""]
     """Step of the rollout [s]."""
 
-    def init(self, sample: Sample) -> _Memory:
+    def init(self, sample: Sample) -> _State:
         k, dtype = self.horizons.shape[0], sample.time.dtype
         none = jnp.zeros_like(sample.mode)
         probe = Probe(
@@ -56,22 +56,22 @@ class HorizonRecorder:
             jnp.zeros(k, jnp.uint32),
         )
         far = jnp.full_like(sample.time, jnp.inf)
-        return _Memory(self.objective.init(sample), none, far, none.astype(jnp.uint32), probe)
+        return _State(self.objective.init(sample), none, far, none.astype(jnp.uint32), probe)
 
-    def update(self, memory: _Memory, sample: Sample) -> _Memory:
-        objective = self.objective.update(memory.objective, sample)
+    def update(self, state: _State, sample: Sample) -> _State:
+        objective = self.objective.update(state.objective, sample)
         at_gate = sample.crossing == GATE_CROSSING
-        crossings = memory.crossings + at_gate.astype(jnp.int32)
-        speed = jnp.where(at_gate, jnp.minimum(memory.speed, sample.crossing_speed), memory.speed)
+        crossings = state.crossings + at_gate.astype(jnp.int32)
+        speed = jnp.where(at_gate, jnp.minimum(state.speed, sample.crossing_speed), state.speed)
         step = jnp.floor(sample.time / self.dt).astype(jnp.uint32)
-        mixed = (memory.path + sample.crossing.astype(jnp.uint32)) * jnp.uint32(2654435761) + step
-        path = jnp.where(sample.crossing > 0, mixed, memory.path)
-        now = Probe(self.objective.finish(objective, sample), sample.state.vector(), crossings, speed, path)
+        mixed = (state.path + sample.crossing.astype(jnp.uint32)) * jnp.uint32(2654435761) + step
+        path = jnp.where(sample.crossing > 0, mixed, state.path)
+        now = Probe(finalize(self.objective, objective, sample), sample.state.vector(), crossings, speed, path)
         within = (sample.time <= self.horizons) & (sample.crossing == 0)  # horizons are grid points
         probe = jax.tree.map(
-            lambda new, old: jnp.where(within.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), now, memory.probe
+            lambda new, old: jnp.where(within.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), now, state.probe
         )
-        return _Memory(objective, crossings, speed, path, probe)
+        return _State(objective, crossings, speed, path, probe)
 
-    def finish(self, memory: _Memory, last: Sample) -> tuple[Probe, Int[Array, ""]]:
-        return memory.probe, last.flag
+    def finalize(self, state: _State, last: Sample) -> tuple[Probe, Int[Array, ""]]:
+        return state.probe, last.flag

@@ -15,7 +15,7 @@ from jaxtyping import Shaped
 from cpjax import archive, files, io
 from cpjax.controllers.protocol import Controller, Law, ModalController, as_controller
 from cpjax.errors import InputError
-from cpjax.sim.metrics import Fold
+from cpjax.sim.metrics import Metric
 from cpjax.sim.plants import Plant, PlantState
 from cpjax.sim.rollout import default_metrics
 from cpjax.sim.settings import Simulation, check_names
@@ -35,7 +35,7 @@ def record_sweep(
     controller: Controller | ModalController | Law,
     starts: PlantState,
     *,
-    metrics: Fold | None = None,
+    metrics: Metric | None = None,
     about: Mapping[str, Any] | None = None,
     chunk: int | None = None,
     block: int | None = None,

@@ -18,7 +18,7 @@ from cpjax.fields import renamed
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, number, part, pytree
-from cpjax.sim.metrics import Fold, Integral, MetricState, Sample, TimeOutside
+from cpjax.sim.metrics import Integral, Metric, MetricState, Sample, TimeOutside, finalize
 
 
 class _Integral:
@@ -30,13 +30,13 @@ class _Integral:
     def init(self, sample: Sample) -> Integral:
         return jnp.zeros_like(sample.time), self.rate(sample.state, sample.voltage)
 
-    def update(self, memory: Integral, sample: Sample) -> Integral:
-        total, before = memory
+    def update(self, state: Integral, sample: Sample) -> Integral:
+        total, before = state
         until = self.rate(sample.state, sample.voltage_before)
         return total + 0.5 * sample.elapsed * (before + until), self.rate(sample.state, sample.voltage)
 
-    def finish(self, memory: Integral, last: Sample) -> Float[Array, ""]:
-        return memory[0]
+    def finalize(self, state: Integral, last: Sample) -> Float[Array, ""]:
+        return state[0]
 
 
 @pytree
@@ -88,14 +88,14 @@ class VoltageVariation:
     def init(self, sample: Sample) -> Float[Array, ""]:
         return jnp.zeros_like(sample.time)
 
-    def update(self, memory: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
+    def update(self, state: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
         moved = self._size(sample.voltage - sample.voltage_before)
         if sample.voltage_until is not None:
             moved = moved + self._size(sample.voltage_until - sample.voltage_since)
-        return memory + moved
+        return state + moved
 
-    def finish(self, memory: Float[Array, ""], last: Sample) -> Float[Array, ""]:
-        return memory
+    def finalize(self, state: Float[Array, ""], last: Sample) -> Float[Array, ""]:
+        return state
 
     def _size(self, change: Float[Array, ""]) -> Float[Array, ""]:
         return jnp.sqrt(change * change + self.rounding * self.rounding) - self.rounding
@@ -111,11 +111,11 @@ class TerminalCost:
     def init(self, sample: Sample) -> Float[Array, ""]:
         return self._outside(sample)
 
-    def update(self, memory: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
+    def update(self, state: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
         return self._outside(sample)
 
-    def finish(self, memory: Float[Array, ""], last: Sample) -> Float[Array, ""]:
-        return memory
+    def finalize(self, state: Float[Array, ""], last: Sample) -> Float[Array, ""]:
+        return state
 
     def _outside(self, sample: Sample) -> Float[Array, ""]:
         return TimeOutside(self.angle_width, self.position_width)._outside(sample)
@@ -130,11 +130,11 @@ class RemainingTime:
     def init(self, sample: Sample) -> Float[Array, ""]:
         return jnp.zeros_like(sample.time)
 
-    def update(self, memory: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
-        return memory + sample.elapsed
+    def update(self, state: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
+        return state + sample.elapsed
 
-    def finish(self, memory: Float[Array, ""], last: Sample) -> Float[Array, ""]:
-        return jnp.asarray(self.duration, memory.dtype) - memory
+    def finalize(self, state: Float[Array, ""], last: Sample) -> Float[Array, ""]:
+        return jnp.asarray(self.duration, state.dtype) - state
 
 
 @pytree
@@ -144,38 +144,38 @@ class Travel:
     def init(self, sample: Sample) -> Float[Array, ""]:
         return jnp.zeros_like(sample.time)
 
-    def update(self, memory: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
-        return fast_maximum(memory, jnp.abs(sample.state.x))
+    def update(self, state: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
+        return fast_maximum(state, jnp.abs(sample.state.x))
 
-    def finish(self, memory: Float[Array, ""], last: Sample) -> Float[Array, ""]:
-        return memory
+    def finalize(self, state: Float[Array, ""], last: Sample) -> Float[Array, ""]:
+        return state
 
 
 class _Several:
     """Several metrics computed together."""
 
-    terms: tuple[Fold, ...]
+    terms: tuple[Metric, ...]
 
     def init(self, sample: Sample) -> tuple[MetricState, ...]:
         return tuple(term.init(sample) for term in self.terms)
 
-    def update(self, memory: tuple[MetricState, ...], sample: Sample) -> tuple[MetricState, ...]:
-        return tuple(term.update(m, sample) for term, m in zip(self.terms, memory, strict=True))
+    def update(self, state: tuple[MetricState, ...], sample: Sample) -> tuple[MetricState, ...]:
+        return tuple(term.update(m, sample) for term, m in zip(self.terms, state, strict=True))
 
-    def _results(self, memory: tuple[MetricState, ...], last: Sample) -> list[Any]:
-        return [term.finish(m, last) for term, m in zip(self.terms, memory, strict=True)]
+    def _results(self, state: tuple[MetricState, ...], last: Sample) -> list[Any]:
+        return [finalize(term, m, last) for term, m in zip(self.terms, state, strict=True)]
 
 
 @pytree
 class WeightedSum(_Several):
     """Weighted sum of the results of several metrics."""
 
-    terms: tuple[Fold, ...]
+    terms: tuple[Metric, ...]
     weights: tuple[Scalar, ...]
 
-    def finish(self, memory: tuple[MetricState, ...], last: Sample) -> Float[Array, ""]:
+    def finalize(self, state: tuple[MetricState, ...], last: Sample) -> Float[Array, ""]:
         total = jnp.zeros_like(last.time)
-        for weight, result in zip(self.weights, self._results(memory, last), strict=True):
+        for weight, result in zip(self.weights, self._results(state, last), strict=True):
             total = total + jnp.asarray(weight, dtype=total.dtype) * result
         return total
 
@@ -188,17 +188,17 @@ class Lagrangian(_Several):
     when the run is stopped early.
     """
 
-    terms: tuple[Fold, ...]
+    terms: tuple[Metric, ...]
     """Metrics: the time outside the target, the costs, and the remaining time of a stopped run."""
     multipliers: tuple[Scalar, ...]
     """Multiplier of each cost [s per unit of the cost]."""
     stop_penalty: Scalar
     """Extra weight of each second lost when a run stops early [1]."""
 
-    def finish(
-        self, memory: tuple[MetricState, ...], last: Sample
+    def finalize(
+        self, state: tuple[MetricState, ...], last: Sample
     ) -> tuple[Float[Array, ""], tuple[Float[Array, ""], ...]]:
-        time, *costs, undone = self._results(memory, last)
+        time, *costs, undone = self._results(state, last)
         total = time + undone * (1.0 + self.stop_penalty)
         for multiplier, cost in zip(self.multipliers, costs, strict=True):
             total = total + multiplier * cost
@@ -224,7 +224,7 @@ class Goal:
         if not any(float(getattr(self, name)) > 0.0 for name in WEIGHTS):
             raise InputError("Goal", self, "with at least one weight above 0")
 
-    def fold(self, plant: CartPole, width: Scalar, duration: float) -> Fold:
+    def metric(self, plant: CartPole, width: Scalar, duration: float) -> Metric:
         """Returns the metric that computes the objective of one run [s].
 
         The time that remains when a flag stops a run counts as outside the target, beyond the track, at the wrong
@@ -236,7 +236,7 @@ class Goal:
           duration: of the whole run [s].
         """
         limit, supply = float(self.track_limit), float(plant.motor.voltage_limit)
-        makers: Mapping[str, Callable[[], Fold]] = {
+        makers: Mapping[str, Callable[[], Metric]] = {
             "time": lambda: TimeOutside(width, width),
             "effort": Effort,
             "track": lambda: TrackExcess(limit, 0.1 * limit),

@@ -89,7 +89,7 @@ class _Tuner:
         self.plant, self.free, self.plan = plant, free, plan
         schedule = optax.cosine_decay_schedule(plan.learning_rate, max(1, plan.steps), 0.05)
         self.optimiser = optax.adam(schedule)
-        self.fold = ProtocolMetrics(track_limit=plan.goal.track_limit)
+        self.metric = ProtocolMetrics(track_limit=plan.goal.track_limit)
         self.located: dict[str, Any] = {"duration": plan.duration, "dt": plan.dt, "switching": "located"}
         self.located["spare_steps"] = plan.spare_steps
         self.iterations = round(plan.duration / plan.dt) + plan.spare_steps
@@ -234,8 +234,8 @@ class _Tuner:
 
         def objective(vector: Vector, start: State, plant: CartPole | None) -> Float[Array, ""]:
             plant = self.plant if plant is None else plant
-            fold = plan.goal.fold(self.free.model, width, plan.duration)
-            value: Float[Array, ""] = measure(plant, self.free.build(vector), start, **self.located, metrics=fold)
+            metric = plan.goal.metric(self.free.model, width, plan.duration)
+            value: Float[Array, ""] = measure(plant, self.free.build(vector), start, **self.located, metrics=metric)
             return value
 
         values, slopes = jax.vmap(functools.partial(jax.value_and_grad(objective), vector))(starts, plants)
@@ -302,7 +302,7 @@ class _Tuner:
 
     def _run(self, controller: Hybrid, start: State, plant: CartPole | None, **settings: Any) -> Metrics:
         plant = self.plant if plant is None else plant
-        found: Metrics = measure(plant, controller, start, metrics=self.fold, **settings)
+        found: Metrics = measure(plant, controller, start, metrics=self.metric, **settings)
         return found
 
 

@@ -106,7 +106,7 @@ class FurutaTimeOutside:
         _, cos = sin_cos(sample.state.theta)
         return memory + sample.elapsed * (1.0 - jnp.exp(-25.0 * (1.0 - cos)))
 
-    def finish(self, memory, last):
+    def finalize(self, memory, last):
         return memory
 
 

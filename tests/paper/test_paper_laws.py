@@ -39,7 +39,7 @@ class SignedSwingUp:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """Fold: (highest cos(theta), pendulum energy at the end, and its extremes after `since` seconds)."""
+    """Metric: (highest cos(theta), pendulum energy at the end, and its extremes after `since` seconds)."""
 
     plant: cpjax.CartPole
     since: float = 0.0
@@ -58,7 +58,7 @@ class Reach:
             jnp.where(late, jnp.maximum(high, energy), high),
         )
 
-    def finish(self, memory, last):
+    def finalize(self, memory, last):
         highest, low, high = memory
         return jnp.degrees(jnp.arccos(highest)), self.plant.pendulum_energy(last.state), low, high
 
@@ -135,9 +135,9 @@ def test_the_corrected_law_inverted_to_a_voltage_gets_to_the_switch_from_every_s
 def test_the_corrected_law_reaches_the_upright_energy_only_without_a_voltage_limit():
     def late_energy(limit):
         plant = dataclasses.replace(APPENDIX, motor=dataclasses.replace(APPENDIX.motor, voltage_limit=limit))
-        fold = Reach(plant, 50.0)
+        metric = Reach(plant, 50.0)
         law = paper.LAWS["corrected"](plant)
-        run = cpjax.measure(plant, law, at(math.pi - 0.1), clock="continuous", duration=60.0, dt=0.002, metrics=fold)
+        run = cpjax.measure(plant, law, at(math.pi - 0.1), clock="continuous", duration=60.0, dt=0.002, metrics=metric)
         return float(run[2]), float(run[3])
 
     low, high = late_energy(math.inf)

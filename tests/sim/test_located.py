@@ -200,7 +200,7 @@ class Elapsed:
         apart = jnp.where(sample.time > 0.0, sample.elapsed, jnp.inf)
         return jnp.minimum(shortest, apart), crossings + (sample.crossing > 0).astype(jnp.int32)
 
-    def finish(self, memory, last):
+    def finalize(self, memory, last):
         return (*memory, last.flag)
 
 
@@ -396,8 +396,8 @@ class OutsideAndFlag:
     def update(self, memory, sample):
         return self.outside.update(memory, sample)
 
-    def finish(self, memory, last):
-        return self.outside.finish(memory, last), last.flag
+    def finalize(self, memory, last):
+        return self.outside.finalize(memory, last), last.flag
 
 
 LOWEST = (0.3, 0.3, 0.05, 0.3, 1.0, 1.0, 10.0, 1.0, 3.0, 0.3, -0.5, -2.0, -math.pi, -8.0)

@@ -95,7 +95,7 @@ class Effort:
     def update(self, memory, sample):
         return memory + sample.elapsed * sample.voltage_since * sample.voltage_since
 
-    def finish(self, memory, last):
+    def finalize(self, memory, last):
         return memory
 
 
@@ -233,7 +233,7 @@ class TimeSwingingUp:
     def update(self, memory, sample):
         return memory + jnp.where(sample.mode_before == 0, sample.elapsed, 0.0)
 
-    def finish(self, memory, last):
+    def finalize(self, memory, last):
         return memory
 
 

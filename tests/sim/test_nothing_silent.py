@@ -221,7 +221,7 @@ class GrowingMetric:
     def update(self, memory, sample):
         return sample.time
 
-    def finish(self, memory, last):
+    def finalize(self, memory, last):
         return memory
 
 
@@ -464,7 +464,7 @@ class Results:
     def update(self, memory, sample):
         return memory
 
-    def finish(self, memory, last):
+    def finalize(self, memory, last):
         return jax.random.key(0) if self.end == "key" else self.end
 
 
@@ -482,8 +482,8 @@ def test_what_jax_takes_for_no_array_is_named(function):
     for controller, metrics, message in (
         (TextMemory(), None, r"controller\.init: memory\['phase'\] = 'a str': must be a number or an array"),
         (CENTRED, Results(begin="text"), r"metrics\.init = 'a str': must be a number or an array"),
-        (CENTRED, Results(end="text"), r"metrics\.finish = 'a str': must be a number or an array"),
-        (CENTRED, Results(end="key"), r"metrics\.finish = 'a random key': must be a number or an array"),
+        (CENTRED, Results(end="text"), r"metrics\.finalize = 'a str': must be a number or an array"),
+        (CENTRED, Results(end="key"), r"metrics\.finalize = 'a random key': must be a number or an array"),
         (Huge(), None, r"controller\.voltage = 'a int': must be a scalar"),
     ):
         with pytest.raises(cpjax.InputError, match=message):

@@ -78,10 +78,10 @@ def test_the_metrics_are_those_of_the_protocols_definitions(law, design):
 
 
 def test_the_settling_metrics_know_late_early_and_lost_bands():
-    fold = cpjax.ProtocolMetrics()
+    metric = cpjax.ProtocolMetrics()
 
     def judged(x):
-        """The fold's verdict on a made-up path of the cart, one sample a second."""
+        """The metric's verdict on a made-up path of the cart, one sample a second."""
         zero = jnp.asarray(0.0)
         samples = [
             cpjax.sim.metrics.Sample(
@@ -101,10 +101,10 @@ def test_the_settling_metrics_know_late_early_and_lost_bands():
             )
             for i, v in enumerate(x)
         ]
-        memory = fold.init(samples[0])
+        memory = metric.init(samples[0])
         for sample in samples:
-            memory = fold.update(memory, sample)
-        result = fold.finish(memory, samples[-1])
+            memory = metric.update(memory, sample)
+        result = metric.finalize(memory, samples[-1])
         return float(result.settling_time), bool(result.success)
 
     assert judged([0.0] * 5) == (0.0, True)
@@ -118,8 +118,8 @@ def test_the_settling_metrics_know_late_early_and_lost_bands():
 def test_a_track_limit_turns_a_wide_success_into_a_failure(caught):
     travel = float(caught.metrics.cart_travel)
     for limit, success in ((travel + 1e-6, True), (travel - 1e-6, False)):
-        fold = cpjax.ProtocolMetrics(track_limit=limit)
-        assert bool(cpjax.measure(PLANT, CENTRED, START, metrics=fold, **EVALUATION).success) == success
+        metric = cpjax.ProtocolMetrics(track_limit=limit)
+        assert bool(cpjax.measure(PLANT, CENTRED, START, metrics=metric, **EVALUATION).success) == success
 
 
 def test_a_longer_control_period_holds_the_voltage_and_the_mode_between_instants():
@@ -285,8 +285,8 @@ def test_a_run_that_settles_where_its_regulator_holds_it_is_a_success():
     law = cpjax.StateFeedback(paper.PRINTED_GAINS["placement"], reference=State(0.3, 0.0, 0.0, 0.0))
     settings = {"duration": 6.0, "dt": 0.002, "clock": "sampled"}
     for where, success in ((0.3, True), (0.0, False)):
-        fold = cpjax.ProtocolMetrics(reference_x=where)
-        result = cpjax.measure(PLANT, law, State(0.0, 0.0, 0.1, 0.0), metrics=fold, **settings)
+        metric = cpjax.ProtocolMetrics(reference_x=where)
+        result = cpjax.measure(PLANT, law, State(0.0, 0.0, 0.1, 0.0), metrics=metric, **settings)
         assert bool(result.success) == success
 
 
@@ -329,3 +329,20 @@ def test_a_component_that_an_optimiser_moved_out_of_its_range_is_refused():
     moved = jax.tree.map(lambda leaf: leaf - 2.0, PLANT)
     with pytest.raises(cpjax.InputError, match=r"plant\.cart_mass = -1\.0: must be a finite number above 0"):
         cpjax.rollout(moved, CENTRED, START, clock="continuous", duration=0.1, dt=0.002)
+
+
+def test_a_metric_whose_method_is_called_finish_works_and_warns():
+    @cpjax.pytree.pytree
+    class Furthest:
+        def init(self, sample):
+            return jnp.abs(sample.state.x)
+
+        def update(self, state, sample):
+            return jnp.maximum(state, jnp.abs(sample.state.x))
+
+        def finish(self, state, last):
+            return state
+
+    with pytest.warns(DeprecationWarning, match=r"Furthest\.finish is now called finalize"):
+        found = cpjax.measure(PLANT, CENTRED, START, metrics=Furthest(), duration=0.1, dt=0.01)
+    assert float(found) == float(cpjax.measure(PLANT, CENTRED, START, duration=0.1, dt=0.01).cart_travel)

@@ -41,8 +41,8 @@ class OutsideAndEffort:
         step = 0.5 * sample.elapsed * (sample.voltage_since**2 + sample.voltage_before**2)
         return self.outside.update(memory[0], sample), memory[1] + step
 
-    def finish(self, memory, last):
-        return self.outside.finish(memory[0], last), memory[1]
+    def finalize(self, memory, last):
+        return self.outside.finalize(memory[0], last), memory[1]
 
 
 @pytest.mark.slow  # a minute of compiling each

@@ -16,7 +16,7 @@ from cpjax.study.fronts.cache import Search, load_or_run
 from cpjax.study.fronts.config import COSTS, FrontConfig
 from cpjax.study.fronts.evaluator import Evaluated, nondominated_sort
 from cpjax.study.fronts.reference_point import objectives, reference_points
-from cpjax.study.fronts.trace import FOLDS, GRADIENT_STEP, trace_fronts
+from cpjax.study.fronts.trace import GRADIENT_STEP, METRICS, trace_fronts
 from cpjax.tune.baseline import baseline
 from cpjax.tune.objective import Lagrangian, RemainingTime, VoltageVariation
 from cpjax.tune.parameters import free_parameters
@@ -32,7 +32,7 @@ def test_the_time_that_is_minimised_has_every_cost_at_its_price():
     run = {"duration": 2.0, "dt": 0.005, "clock": "sampled"}
     protocol = cpjax.measure(PLANT, law, START, **run)
     time = cpjax.measure(PLANT, law, START, metrics=TimeOutside(0.05, 0.05), **run)
-    costs = [VoltageVariation(1e-9) if name == "voltage_variation" else FOLDS[name] for name in COSTS]
+    costs = [VoltageVariation(1e-9) if name == "voltage_variation" else METRICS[name] for name in COSTS]
     terms = (TimeOutside(0.05, 0.05), *costs, RemainingTime(2.0))
     total, spent = cpjax.measure(PLANT, law, START, metrics=Lagrangian(terms, (0.01, 2.0, 0.0), 10.0), **run)
     np.testing.assert_allclose(spent, [getattr(protocol, cost) for cost in COSTS], rtol=1e-5)

@@ -26,8 +26,10 @@ RUN = {"duration": 3.0, "dt": 0.005}
 
 
 def test_terms_are_the_integrals_they_say():
-    fold = WeightedSum((Effort(), VoltageVariation(1e-9), TrackExcess(0.3, 0.1), TerminalCost()), (1.0, 0.0, 0.0, 0.0))
-    kept = cpjax.rollout(PLANT, LAW, START, clock="sampled", metrics=fold, **RUN)
+    metric = WeightedSum(
+        (Effort(), VoltageVariation(1e-9), TrackExcess(0.3, 0.1), TerminalCost()), (1.0, 0.0, 0.0, 0.0)
+    )
+    kept = cpjax.rollout(PLANT, LAW, START, clock="sampled", metrics=metric, **RUN)
     protocol = cpjax.measure(PLANT, LAW, START, clock="sampled", **RUN)
     assert float(kept.metrics) == pytest.approx(float(protocol.effort), rel=1e-12)
     jerk = cpjax.measure(PLANT, LAW, START, clock="sampled", metrics=VoltageVariation(1e-9), **RUN)
@@ -47,7 +49,7 @@ def test_every_terms_gradient_is_its_difference():
     def value(gain):
         law = cpjax.Hybrid(cpjax.EnergySwingUp(PLANT, energy_gain=gain, cart_stiffness=2.0), LAW.regulator, LAW.gate)
         return cpjax.measure(
-            PLANT, law, START, duration=1.5, dt=0.005, switching="located", metrics=goal.fold(PLANT, 0.3, 1.5)
+            PLANT, law, START, duration=1.5, dt=0.005, switching="located", metrics=goal.metric(PLANT, 0.3, 1.5)
         )
 
     at = jnp.asarray(3.0)
@@ -85,12 +87,12 @@ def test_a_track_weight_needs_a_limit_and_a_goal_a_weight():
 def test_what_a_stopped_run_leaves_undone_counts_as_badly_spent():
     """Two spare steps are too few for the first swings: a run that is stopped early must not look the better one."""
     goal = Goal(effort=0.01)
-    run = {"duration": 3.0, "dt": 0.02, "switching": "located", "metrics": goal.fold(PLANT, 0.3, 3.0)}
+    run = {"duration": 3.0, "dt": 0.02, "switching": "located", "metrics": goal.metric(PLANT, 0.3, 3.0)}
     stopped = cpjax.rollout(PLANT, LAW, START, spare_steps=2, **run)
     assert stopped.flag & cpjax.Flag.OVERFLOW
     whole = cpjax.rollout(PLANT, LAW, START, **run)
     assert whole.flag == 0
-    reached = cpjax.rollout(PLANT, LAW, START, spare_steps=2, **(run | {"metrics": goal.fold(PLANT, 0.3, 1e-9)}))
+    reached = cpjax.rollout(PLANT, LAW, START, spare_steps=2, **(run | {"metrics": goal.metric(PLANT, 0.3, 1e-9)}))
     rest = float(stopped.metrics - reached.metrics) / (1.0 + 0.01 * 144.0)
     assert rest == pytest.approx(3.0, rel=1e-6)
     assert float(stopped.metrics) > float(whole.metrics)

@@ -56,7 +56,7 @@ Report = Callable[[int, int, str], None]
 GRADIENT_STEP = 60.0
 """Steps of values on the fastest path that take as long as one gradient step here (`experiments/tuner_cost.py`)."""
 
-FOLDS: Mapping[str, Any] = {"effort": Effort(), "cart_travel": Travel(), "voltage_variation": VoltageVariation()}
+METRICS: Mapping[str, Any] = {"effort": Effort(), "cart_travel": Travel(), "voltage_variation": VoltageVariation()}
 """Differentiable metric for each of `COSTS`."""
 
 
@@ -285,9 +285,9 @@ class Tracer:
     def _slope(self, vector: Vector, aim: Aim, starts: State) -> tuple[Vector, Float[Array, " costs"]]:
         """Returns the gradient, norm-clipped per initial state and then averaged; and the mean costs."""
         plan, plant, free = self._plan, self._evaluator.plant_at(aim.supply), self._evaluator.free_at(aim.supply)
-        costs = (FOLDS[cost] for cost in COSTS)
+        costs = (METRICS[cost] for cost in COSTS)
         terms = (TimeOutside(plan.width, plan.width), *costs, RemainingTime(plan.duration))
-        fold = Lagrangian(terms, tuple(aim.multipliers), plan.stop_penalty)
+        metric = Lagrangian(terms, tuple(aim.multipliers), plan.stop_penalty)
 
         def objective(vector: Vector, start: State) -> tuple[Float[Array, ""], tuple[Float[Array, ""], ...]]:
             found: tuple[Float[Array, ""], tuple[Float[Array, ""], ...]] = measure(
@@ -298,7 +298,7 @@ class Tracer:
                 dt=plan.dt,
                 switching="located",
                 spare_steps=self._spare,
-                metrics=fold,
+                metrics=metric,
             )
             return found
 
