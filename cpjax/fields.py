@@ -26,11 +26,11 @@ RULE = "cpjax"
 JaxOrNumpy: TypeAlias = Array | np.ndarray
 """An array that JAX accepts. Classes hold NumPy arrays until a rollout casts them: no JAX backend starts before."""
 
-Scalar: TypeAlias = Float[JaxOrNumpy, ""] | float
-"""One real number: a Python float, or an array of shape () that JAX may trace. Batches appear only under `vmap`."""
+Scalar: TypeAlias = Float[JaxOrNumpy, ""] | np.floating | float
+"""One real number: a float of Python or NumPy, or an array of shape () that JAX may trace."""
 
-Scalars: TypeAlias = Float[JaxOrNumpy, "*batch"] | float
-"""A real number, or a batch of them."""
+Scalars: TypeAlias = Float[JaxOrNumpy, "*batch"] | np.floating | float
+"""One real number, as `Scalar` in a rollout and under `vmap`, or a batch of them, element by element."""
 
 Size: TypeAlias = float | Callable[[Any], Any]
 """A size in the parameter's unit: a number, or a function of the component; for a motor's parameter, of the plant."""
@@ -332,7 +332,7 @@ def fits(shape: tuple[int, ...], expected: tuple[int | None, ...]) -> bool:
     )
 
 
-def _from_list(name: str, value: Any, allowed: str) -> np.ndarray[Any, Any]:
+def _from_list(name: str, value: Any, allowed: str) -> np.ndarray:
     """Converts a nested list of Python numbers to a float array."""
     try:
         array = np.asarray(value)
@@ -343,7 +343,7 @@ def _from_list(name: str, value: Any, allowed: str) -> np.ndarray[Any, Any]:
         raise InputError(name, value, allowed) from problem
 
 
-def _is_symmetric(matrices: np.ndarray[Any, Any]) -> bool:
+def _is_symmetric(matrices: np.ndarray) -> bool:
     difference = np.abs(matrices - np.swapaxes(matrices, -1, -2))
     return bool(np.max(difference) <= 1e-6 * np.max(np.abs(matrices)))
 

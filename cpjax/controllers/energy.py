@@ -16,7 +16,7 @@ from cpjax.backend.extremes import fast_maximum
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
-from cpjax.pytree import Scalar, Scalars, number, part, pytree
+from cpjax.pytree import Scalars, number, part, pytree
 
 
 @pytree
@@ -42,7 +42,7 @@ class EnergySwingUp:
         "rad", "swing amplitude beyond which the kick is gone", default=0.02, at_least=1e-3, at_most=math.pi / 2
     )
 
-    def acceleration(self, state: State) -> Scalar:
+    def acceleration(self, state: State) -> Scalars:
         """Returns the pivot acceleration that the law demands [m/s^2]."""
         _, cos = sin_cos(state.theta)
         energy = self.model.pendulum_energy(state)
@@ -51,12 +51,12 @@ class EnergySwingUp:
         near = self._kick_weight(state)
         return pump + (1.0 - near) * centring + near * self.kick
 
-    def voltage(self, state: State) -> Scalar:
+    def voltage(self, state: State) -> Scalars:
         """Returns the demanded voltage [V], which yields `acceleration` on the law's model; unclipped."""
         force = self.model.force_for_acceleration(state, self.acceleration(state))
         return self.model.motor.voltage_for_force(force, state.x_dot)
 
-    def _kick_weight(self, state: State) -> Scalar:
+    def _kick_weight(self, state: State) -> Scalars:
         _, cos = sin_cos(state.theta)
         weight = self.model.pole_mass * self.model.gravity * self.model.pole_length
         kinetic = 0.5 * self.model.pivot_inertia * state.theta_dot * state.theta_dot

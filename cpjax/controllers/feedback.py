@@ -15,7 +15,7 @@ from cpjax.linear.lqr import lqr
 from cpjax.linear.lyapunov import lyapunov
 from cpjax.linear.placement import QuadraticFactors, place_polynomial
 from cpjax.plant.state import NAMES, UPRIGHT, State, checked_reference, deviation
-from cpjax.pytree import JaxOrNumpy, Scalar, Scalars, is_traced, matrix, number, part, pytree
+from cpjax.pytree import JaxOrNumpy, Scalars, is_traced, matrix, number, part, pytree
 
 
 class Designed(NamedTuple):
@@ -117,7 +117,7 @@ class StateFeedback:
         if self.design is not None and not hasattr(self.design, "solve"):
             raise InputError("StateFeedback.design", self.design, "LqrWeights, PoleFactors, or None")
 
-    def voltage(self, state: State) -> Scalar:
+    def voltage(self, state: State) -> Scalars:
         """Returns the demanded voltage [V]."""
         s = deviation(state, self.reference)
         return -(self.K[0, 0] * s[0] + self.K[0, 1] * s[1] + self.K[0, 2] * s[2] + self.K[0, 3] * s[3])

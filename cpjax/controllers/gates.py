@@ -8,11 +8,11 @@ below zero for any useful level.
 """
 
 import math
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int32
+from jaxtyping import Array, Float, Int
 
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.controllers.protocol import REGULATE
@@ -21,10 +21,11 @@ from cpjax.plant.state import NAMES, UPRIGHT, State, checked_reference, deviatio
 from cpjax.pytree import JaxOrNumpy, Scalar, Scalars, is_traced, matrix, number, part, pytree
 
 
+@runtime_checkable
 class Gate(Protocol):
     """Interface of a gate, as `Hybrid` uses it."""
 
-    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
+    def margin(self, state: State, mode: Int[Array, ""]) -> Scalar:
         """Returns the margin, smooth in the state: at least 0 where the regulator acts, given the mode until now."""
         ...
 
@@ -39,8 +40,8 @@ class AngleGate:
     def __post_init__(self) -> None:
         _check_widened_angle("AngleGate", self.half_angle, self.hysteresis)
 
-    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
-        """Returns the margin [1]; its boundary depends on the mode (int32) if there is hysteresis."""
+    def margin(self, state: State, mode: Int[Array, ""]) -> Scalars:
+        """Returns the margin [1]; its boundary depends on the mode if there is hysteresis."""
         _, cos = sin_cos(state.theta)
         # Both edges, then one of them is selected: they do not depend on the state, so a batch computes them once.
         (_, way_in), (_, way_out) = sin_cos(self.half_angle), sin_cos(self.half_angle * (1.0 + self.hysteresis))
@@ -61,8 +62,8 @@ class AngleRateGate:
     def __post_init__(self) -> None:
         _check_widened_angle("AngleRateGate", self.half_angle, self.hysteresis)
 
-    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
-        """Returns the margin [1]; its boundary depends on the mode (int32) if there is hysteresis."""
+    def margin(self, state: State, mode: Int[Array, ""]) -> Scalars:
+        """Returns the margin [1]; its boundary depends on the mode if there is hysteresis."""
         _, cos = sin_cos(state.theta)
         # Both regions, then one of them is selected: they do not depend on the state, so a batch computes them once.
         way_in, way_out = self._scales(0.0), self._scales(self.hysteresis)
@@ -70,7 +71,7 @@ class AngleRateGate:
         relative_rate = state.theta_dot * per_rate
         return 1.0 - (1.0 - cos) * per_drop - relative_rate * relative_rate
 
-    def _scales(self, widening: Scalar) -> tuple[Scalar, Scalar]:
+    def _scales(self, widening: Scalars) -> tuple[Scalars, Scalars]:
         """Returns the factors of 1 - cos(theta) and of theta' for a region (1 + widening) times as large."""
         size = 1.0 + widening
         half_edge, _ = sin_cos(0.5 * self.half_angle * size)  # 1 - cos(edge) = 2 sin(edge / 2)^2, without cancellation
@@ -91,8 +92,8 @@ class LyapunovGate:
     def __post_init__(self) -> None:
         object.__setattr__(self, "reference", checked_reference("LyapunovGate.reference", self.reference))
 
-    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
-        """Returns the margin [1]; its boundary depends on the mode (int32) if there is hysteresis."""
+    def margin(self, state: State, mode: Int[Array, ""]) -> Scalars:
+        """Returns the margin [1]; its boundary depends on the mode if there is hysteresis."""
         s = deviation(state, self.reference)
         # Written as a sum, not as a matrix product, so that under vmap each component stays an array of its own.
         form = sum(self.P[i, j] * s[i] * s[j] for i in range(4) for j in range(4))

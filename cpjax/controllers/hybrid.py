@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int32
+from jaxtyping import Array, Int
 
 from cpjax.checks import call, real
 from cpjax.controllers.gates import AngleGate, AngleRateGate, Gate, LyapunovGate
@@ -35,15 +35,15 @@ class Hybrid:
         """Returns the next mode, and the voltage that its law demands [V]."""
         return update_mode(self, memory, measurement)
 
-    def start_mode(self, state: State) -> Int32[Array, ""]:
-        """Returns REGULATE inside the gate's entry region, SWING_UP elsewhere (int32)."""
+    def start_mode(self, state: State) -> Int[Array, ""]:
+        """Returns REGULATE inside the gate's entry region, SWING_UP elsewhere."""
         return self.next_mode(state, jnp.asarray(SWING_UP, dtype=jnp.int32))
 
-    def next_mode(self, state: State, mode: Int32[Array, ""]) -> Int32[Array, ""]:
+    def next_mode(self, state: State, mode: Int[Array, ""]) -> Int[Array, ""]:
         """Returns REGULATE where the gate's margin in the present mode is at least 0, else SWING_UP; no derivative."""
         return jnp.where(self._gate_margin(state, mode) >= 0.0, np.int32(REGULATE), np.int32(SWING_UP))
 
-    def mode_voltage(self, state: State, mode: Int32[Array, ""]) -> Scalar:
+    def mode_voltage(self, state: State, mode: Int[Array, ""]) -> Scalar:
         """Returns the demanded voltage [V] of the law of `mode`.
 
         Both laws are evaluated; the one not selected, if finite, contributes neither value nor derivative.
@@ -59,14 +59,14 @@ class Hybrid:
         margin = self._gate_margin(state, mode)
         return jnp.where(jnp.isnan(margin), jnp.asarray(jnp.nan, voltage.dtype), voltage)
 
-    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
+    def margin(self, state: State, mode: Int[Array, ""]) -> Scalar:
         """Returns the gate's margin, with the sign that makes it positive while `mode` lasts."""
         margin = self._gate_margin(state, mode)
         return jnp.where(mode == REGULATE, margin, -margin)
 
-    def successor(self, mode: Int32[Array, ""]) -> Int32[Array, ""]:
+    def successor(self, mode: Int[Array, ""]) -> Int[Array, ""]:
         """Returns the other mode."""
         return (SWING_UP + REGULATE) - mode
 
-    def _gate_margin(self, state: State, mode: Int32[Array, ""]) -> jax.Array:
+    def _gate_margin(self, state: State, mode: Int[Array, ""]) -> jax.Array:
         return real("controller.gate.margin", call("controller.gate", self.gate, "margin", state, mode))

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int32
+from jaxtyping import Array, Float, Int, Int32
 
 from cpjax.checks import call, integer, real
 from cpjax.errors import InputError
@@ -60,15 +60,15 @@ class Controller(Protocol):
 class ModalController(Protocol):
     """A law for each mode, and the rule that chooses the mode. Modes are int32 scalars."""
 
-    def start_mode(self, state: State) -> Int32[Array, ""]:
+    def start_mode(self, state: State) -> Int[Array, ""]:
         """Returns the mode at the start of a rollout, where there is no earlier mode."""
         ...
 
-    def next_mode(self, state: State, mode: Int32[Array, ""]) -> Int32[Array, ""]:
+    def next_mode(self, state: State, mode: Int[Array, ""]) -> Int[Array, ""]:
         """Returns the mode from this control instant on, given the mode until now."""
         ...
 
-    def mode_voltage(self, state: State, mode: Int32[Array, ""]) -> Scalar:
+    def mode_voltage(self, state: State, mode: Int[Array, ""]) -> Scalar:
         """Returns the demanded terminal voltage [V] of the law that acts in `mode`; the motor clips it."""
         ...
 
@@ -77,11 +77,11 @@ class ModalController(Protocol):
 class SmoothController(ModalController, Protocol):
     """A controller whose mode ends where a smooth function vanishes, so that the instant can be located."""
 
-    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
+    def margin(self, state: State, mode: Int[Array, ""]) -> Scalar:
         """Returns a scalar that is at least 0 while `mode` lasts, smooth in the state near 0."""
         ...
 
-    def successor(self, mode: Int32[Array, ""]) -> Int32[Array, ""]:
+    def successor(self, mode: Int[Array, ""]) -> Int[Array, ""]:
         """Returns the mode after `mode`, once its margin has vanished."""
         ...
 
@@ -130,7 +130,7 @@ def start_memory(controller: ModalController, state: State) -> ModeMemory:
     return ModeMemory(integer("controller.start_mode", call("controller", controller, "start_mode", state)))
 
 
-def demand(controller: ModalController, state: State, mode: Int32[Array, ""]) -> Float[Array, ""]:
+def demand(controller: ModalController, state: State, mode: Int[Array, ""]) -> Float[Array, ""]:
     """Returns the voltage [V] that the law of `mode` demands, in the state's dtype."""
     dtype = jnp.asarray(jax.tree.leaves(state)[0]).dtype
     return real("controller.mode_voltage", call("controller", controller, "mode_voltage", state, mode), dtype)
@@ -148,19 +148,19 @@ class SingleLaw:
     def update(self, memory: tuple[()], measurement: State) -> tuple[tuple[()], Scalar]:
         return (), self._voltage(measurement)
 
-    def start_mode(self, state: State) -> Int32[Array, ""]:
+    def start_mode(self, state: State) -> Int[Array, ""]:
         return jnp.asarray(SWING_UP, dtype=jnp.int32)
 
-    def next_mode(self, state: State, mode: Int32[Array, ""]) -> Int32[Array, ""]:
+    def next_mode(self, state: State, mode: Int[Array, ""]) -> Int[Array, ""]:
         return mode
 
-    def mode_voltage(self, state: State, mode: Int32[Array, ""]) -> Scalar:
+    def mode_voltage(self, state: State, mode: Int[Array, ""]) -> Scalar:
         return self._voltage(state)
 
-    def margin(self, state: State, mode: Int32[Array, ""]) -> Scalar:
+    def margin(self, state: State, mode: Int[Array, ""]) -> Scalar:
         return 1.0
 
-    def successor(self, mode: Int32[Array, ""]) -> Int32[Array, ""]:
+    def successor(self, mode: Int[Array, ""]) -> Int[Array, ""]:
         return mode
 
     def _voltage(self, state: State) -> jax.Array:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from cpjax.controllers.gates import Gate
 from cpjax.controllers.protocol import SWING_UP, Law
 from cpjax.plant.state import State
-from cpjax.pytree import Scalar, Scalars, number, part, pytree
+from cpjax.pytree import Scalars, number, part, pytree
 
 
 @pytree
@@ -27,7 +27,7 @@ class SmoothHybrid:
     gate: Gate = part("a gate", "margin")
     temperature: Scalars = number("1", "margin over which the share rises from 1/2 to 3/4, almost", above=0.0)
 
-    def voltage(self, state: State) -> Scalar:
+    def voltage(self, state: State) -> Scalars:
         """Returns the demanded voltage [V]."""
         margin = self.gate.margin(state, jnp.asarray(SWING_UP, dtype=jnp.int32))
         share = jax.nn.sigmoid(margin / self.temperature)
@@ -47,7 +47,7 @@ class SmoothClip:
     voltage_limit: Scalars = number("V", "supply, as of the motor", above=0.0)
     temperature: Scalars = number("V", "over which the demand bends", above=0.0)
 
-    def voltage(self, state: State) -> Scalar:
+    def voltage(self, state: State) -> Scalars:
         """Returns the demanded voltage [V]."""
         demand, limit, temperature = self.law.voltage(state), self.voltage_limit, self.temperature
         above, below = (demand - limit) / temperature, (demand + limit) / temperature

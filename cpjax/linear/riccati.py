@@ -189,7 +189,7 @@ def _discrete_jvp(primals: Problem, tangents: Problem) -> tuple[Any, Any]:
 
 # --- diagnosis of a missing solution, for error messages --------------------------------------------------------------
 
-_Numbers: TypeAlias = np.ndarray[Any, Any]
+_Numbers: TypeAlias = np.ndarray
 
 
 def _check_weights(time: str, Q: _Numbers, R: _Numbers, N: _Numbers, *, room: float) -> None:

@@ -25,8 +25,8 @@ from cpjax.plant.motor import Motor
 from cpjax.plant.state import ANGLE_LIMIT, NAMES, RUNAWAY_LIMIT, UNITS, State
 from cpjax.pytree import Number, Scalar, Scalars, number, part, pytree
 
-Pair: TypeAlias = tuple[Scalar, Scalar]
-"""Pair of scalars: cart, pole."""
+Pair: TypeAlias = tuple[Scalars, Scalars]
+"""Pair: cart, pole."""
 
 # Reference sizes of parameters whose value may be zero; the fields below declare them (`typical`, `drawn`).
 
@@ -80,7 +80,7 @@ class CartPole:
     motor: Motor = part("a cpjax.Motor", "saturate", "force", "reflected_mass", default_factory=Motor)
 
     @classmethod
-    def rod(cls, *, mass: Scalar, length: Scalar, **others: Any) -> "CartPole":
+    def rod(cls, *, mass: Scalars, length: Scalars, **others: Any) -> "CartPole":
         """Builds a cart-pole whose pole is a uniform rod on the pivot: l = length / 2, J = mass length^2 / 12.
 
         Args:
@@ -106,7 +106,7 @@ class CartPole:
         return dict(zip(NAMES, UNITS, strict=True))
 
     @property
-    def input_limit(self) -> Scalar:
+    def input_limit(self) -> Scalars:
         """Voltage at which the drive clips [V]."""
         return self.motor.voltage_limit
 
@@ -126,7 +126,7 @@ class CartPole:
         """Returns sine and cosine of theta, the only functions of the positions in the accelerations."""
         return sin_cos(q[1])
 
-    def geometry_near(self, geometry: Pair, change: Pair) -> tuple[Pair, Bool[Array, ""]]:
+    def geometry_near(self, geometry: Pair, change: Pair) -> tuple[Pair, Bool[Array, "*batch"]]:
         """Returns sine and cosine of theta after a `change` of the positions, and whether they are rounding-accurate.
 
         Args:
@@ -137,7 +137,7 @@ class CartPole:
         accurate = jnp.abs(turn) <= LARGEST_TURN
         return rotate_by(jnp.asarray(geometry[0]), jnp.asarray(geometry[1]), turn), accurate
 
-    def accelerations(self, geometry: Pair, v: Pair, u: Scalar) -> Pair:
+    def accelerations(self, geometry: Pair, v: Pair, u: Scalars) -> Pair:
         """Returns (x'', theta'') [m/s^2, rad/s^2] under the applied voltage `u` [V].
 
         Args:
@@ -147,23 +147,23 @@ class CartPole:
         force = real("plant.motor.force", call("plant.motor", self.motor, "force", u, v[0]))
         return self.acceleration(*geometry, v, force)
 
-    def outputs(self, state: State, acceleration: Pair, u: Scalar) -> dict[str, Scalar]:
+    def outputs(self, state: State, acceleration: Pair, u: Scalars) -> dict[str, Scalars]:
         """Returns what a trajectory saves beside state and voltage: x'' as `cart_acceleration` [m/s^2]."""
         return {"cart_acceleration": acceleration[0]}
 
     @property
-    def moving_mass(self) -> Scalar:
+    def moving_mass(self) -> Scalars:
         """Mass of the cart plus the reflected mass of the rotor, M [kg]."""
         return self.cart_mass + self.motor.reflected_mass
 
     @property
-    def pivot_inertia(self) -> Scalar:
+    def pivot_inertia(self) -> Scalars:
         """Inertia of the pole about its pivot, J + m l^2 [kg m^2]."""
         return self.pole_inertia + self.pole_mass * self.pole_length * self.pole_length
 
     def acceleration(
-        self, sin: Scalar, cos: Scalar, rates: tuple[Scalar, Scalar], force: Scalar
-    ) -> tuple[Scalar, Scalar]:
+        self, sin: Scalars, cos: Scalars, rates: tuple[Scalars, Scalars], force: Scalars
+    ) -> tuple[Scalars, Scalars]:
         """Solves the equations of motion in the module's docstring for `(x'', theta'')` [m/s^2, rad/s^2].
 
         Args:
@@ -186,14 +186,14 @@ class CartPole:
         theta_ddot = ((self.moving_mass + m) * torque + ml * cos * push) * inverse
         return x_ddot, theta_ddot
 
-    def vector_field(self, state: State, voltage: Scalar) -> State:
+    def vector_field(self, state: State, voltage: Scalars) -> State:
         """Returns the time derivative of `state` under the applied (already clipped) terminal `voltage` [V]."""
         sin, cos = sin_cos(state.theta)
         force = self.motor.force(voltage, state.x_dot)
         x_ddot, theta_ddot = self.acceleration(sin, cos, (state.x_dot, state.theta_dot), force)
         return State(state.x_dot, x_ddot, state.theta_dot, theta_ddot)
 
-    def force_for_acceleration(self, state: State, x_ddot: Scalar) -> Scalar:
+    def force_for_acceleration(self, state: State, x_ddot: Scalars) -> Scalars:
         """Returns the wheel force [N] under which the cart accelerates with `x_ddot` [m/s^2] (inverse dynamics)."""
         sin, cos = sin_cos(state.theta)
         ml = self.pole_mass * self.pole_length
@@ -206,23 +206,23 @@ class CartPole:
             + self.cart_friction * state.x_dot
         )
 
-    def kinetic_energy(self, state: State) -> Scalar:
+    def kinetic_energy(self, state: State) -> Scalars:
         """Returns the kinetic energy of cart, rotor and pole [J]."""
         _, cos = sin_cos(state.theta)
         coupling = self.pole_mass * self.pole_length * cos * state.x_dot * state.theta_dot
         cart = 0.5 * (self.moving_mass + self.pole_mass) * state.x_dot * state.x_dot
         return cart - coupling + 0.5 * self.pivot_inertia * state.theta_dot * state.theta_dot
 
-    def potential_energy(self, state: State) -> Scalar:
+    def potential_energy(self, state: State) -> Scalars:
         """Returns the potential energy m g l cos(theta) [J], zero at the pivot's height."""
         _, cos = sin_cos(state.theta)
         return self.pole_mass * self.gravity * self.pole_length * cos
 
-    def total_energy(self, state: State) -> Scalar:
+    def total_energy(self, state: State) -> Scalars:
         """Returns the sum of kinetic and potential energy [J]."""
         return self.kinetic_energy(state) + self.potential_energy(state)
 
-    def pendulum_energy(self, state: State) -> Scalar:
+    def pendulum_energy(self, state: State) -> Scalars:
         """Returns the energy of the pole about a pivot at rest [J]; zero upright at rest, -2 m g l hanging at rest.
 
         E = 1/2 (J + m l^2) theta'^2 + m g l (cos(theta) - 1)        (paper, section IV-C)
@@ -231,7 +231,7 @@ class CartPole:
         weight = self.pole_mass * self.gravity * self.pole_length
         return 0.5 * self.pivot_inertia * state.theta_dot * state.theta_dot + weight * (cos - 1.0)
 
-    def dissipated_power(self, state: State) -> Scalar:
+    def dissipated_power(self, state: State) -> Scalars:
         """Returns the power lost in cart and pivot friction [W]; the motor's losses are part of the wheel force."""
         cart = self.cart_friction * state.x_dot * state.x_dot
         return cart + self.pivot_friction * state.theta_dot * state.theta_dot

@@ -5,10 +5,10 @@ from typing import Any
 from jaxtyping import Array, Float
 
 from cpjax.backend.extremes import fast_maximum, fast_minimum
-from cpjax.pytree import Scalar, Scalars, number, pytree
+from cpjax.pytree import Scalars, number, pytree
 
 
-def _at_the_rotor(of_the_cart: float, plant: Any) -> Scalar:
+def _at_the_rotor(of_the_cart: float, plant: Any) -> Scalars:
     """Converts a mass or damping of the cart to the equivalent inertia or damping at the rotor."""
     return of_the_cart * (plant.motor.wheel_radius / plant.motor.gear_ratio) ** 2
 
@@ -52,15 +52,15 @@ class Motor:
         "V", "supply: |u| is clipped here", default=12.0, above=0.0, infinite=True, linear=False
     )
 
-    def saturate(self, voltage: Scalar) -> Float[Array, ""]:
+    def saturate(self, voltage: Scalars) -> Float[Array, "*batch"]:
         """Clips the demanded voltage [V] to the supply; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
         return fast_maximum(-self.voltage_limit, fast_minimum(self.voltage_limit, voltage))
 
-    def current(self, voltage: Scalar, x_dot: Scalar) -> Scalar:
+    def current(self, voltage: Scalars, x_dot: Scalars) -> Scalars:
         """Returns the winding current [A] at an applied voltage [V] and cart velocity [m/s]."""
         return (voltage - self.back_emf_constant * self.gear_ratio / self.wheel_radius * x_dot) / self.resistance
 
-    def force(self, voltage: Scalar, x_dot: Scalar) -> Scalar:
+    def force(self, voltage: Scalars, x_dot: Scalars) -> Scalars:
         """Returns the horizontal force of the wheels on the cart [N].
 
         F = (n k_T / (R r)) u - n^2 (B_m + k_T k_V / R) x' / r^2        (paper, section III; r = 1 m and n = 1 there)
@@ -71,23 +71,23 @@ class Motor:
         """
         return self.force_per_voltage * voltage - self.damping * x_dot
 
-    def voltage_for_force(self, force: Scalar, x_dot: Scalar) -> Scalar:
+    def voltage_for_force(self, force: Scalars, x_dot: Scalars) -> Scalars:
         """Returns the unclipped terminal voltage [V] for a wheel force `force` [N] at cart velocity `x_dot` [m/s]."""
         return (force + self.damping * x_dot) * (1.0 / self.force_per_voltage)
 
     @property
-    def force_per_voltage(self) -> Scalar:
+    def force_per_voltage(self) -> Scalars:
         """Wheel force per terminal voltage, n k_T / (R r) [N/V]."""
         return self.gear_ratio * self.torque_constant / (self.resistance * self.wheel_radius)
 
     @property
-    def damping(self) -> Scalar:
+    def damping(self) -> Scalars:
         """Damping of the cart by bearing friction and back-EMF together [N s/m]: n^2 (B_m + k_T k_V / R) / r^2."""
         ratio = self.gear_ratio / self.wheel_radius
         return ratio * ratio * (self.viscous_friction + self.torque_constant * self.back_emf_constant / self.resistance)
 
     @property
-    def reflected_mass(self) -> Scalar:
+    def reflected_mass(self) -> Scalars:
         """Rotor inertia as an equivalent mass at the cart [kg]: n^2 J_m / r^2."""
         ratio = self.gear_ratio / self.wheel_radius
         return ratio * ratio * self.rotor_inertia
