@@ -1,10 +1,15 @@
 """The layers of docs/architecture.md, held against the code."""
 
 import ast
+import importlib
+import inspect
 import re
 import subprocess
 import sys
+import types
 from pathlib import Path
+
+import pytest
 
 import cpjax
 
@@ -142,3 +147,16 @@ def test_no_docstring_begins_with_of_or_what():
         if re.match(r'\s*"""(Of|What)\b', line)
     ]
     assert found == []
+
+
+PACKAGES = ["backend", "numeric", "linear", "plant", "controllers", "sim", "tune", "study", "study.fronts", "paper"]
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_a_package_exports_its_public_names(name):
+    package = importlib.import_module(f"cpjax.{name}")
+    assert package.__all__
+    for public in package.__all__:
+        thing = getattr(package, public)
+        assert not isinstance(thing, types.ModuleType), f"{name}.{public} is a module: a submodule has its name"
+        assert not inspect.isroutine(thing) or thing.__doc__, public

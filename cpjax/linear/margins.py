@@ -141,7 +141,7 @@ def loop_polynomials(
     return jnp.stack([K @ M @ B for M in adjugate]), D
 
 
-def margins(
+def stability_margins(
     A: Real[MatrixLike, "n n"],
     B: Real[MatrixLike, "n 1"] | Real[MatrixLike, " n"],
     K: Real[MatrixLike, "1 n"] | Real[MatrixLike, " n"],
@@ -172,6 +172,10 @@ def margins(
       InputError: not finite real matrices of these shapes. An unstable loop is no error: its margins are NaN.
     """
     return _margins(*_single_input(A, B, K))
+
+
+margins = stability_margins
+"""The name until version 0.1."""
 
 
 @jax.jit

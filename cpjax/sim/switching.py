@@ -90,7 +90,7 @@ class Motion(NamedTuple):
     elapsed: Step
     """Time between the last two points that were reached [s]."""
     stage: Int[Array, ""]
-    """What the next iteration does: `RUN`, `LANDED`, or the number of the correction, int32."""
+    """Names what the next iteration does: `RUN`, `LANDED`, or the number of the correction, int32."""
     guard: Int[Array, ""]
     """Number of the guard whose crossing is being located, int32."""
     reach: Step

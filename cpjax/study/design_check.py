@@ -21,7 +21,7 @@ from cpjax.linear.limits import (
     lyapunov_function,
     saturation_angle,
 )
-from cpjax.linear.margins import Margins, closed_loop_poles, margins
+from cpjax.linear.margins import Margins, closed_loop_poles, stability_margins
 from cpjax.linear.structure import POSITION_AND_ANGLE, Structure, controllability, observability
 from cpjax.plant import CartPole, linearize
 from cpjax.plant.state import NAMES
@@ -87,7 +87,7 @@ def check_design(plant: CartPole, regulator: StateFeedback, gate: Gate) -> Desig
     A, B = linearize(plant)
     K = jnp.asarray(regulator.K, dtype=A.dtype)
     limit = plant.motor.voltage_limit
-    found = margins(A, B, K)
+    found = stability_margins(A, B, K)
     angle = _opening_angle(gate)
     P = level = limited_by = extent = None
     if bool(found.stable):

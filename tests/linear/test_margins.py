@@ -15,7 +15,13 @@ from tables import rows
 
 import cpjax
 from cpjax import InputError, paper
-from cpjax.linear.margins import Margins, characteristic_polynomial, closed_loop_poles, loop_polynomials, margins
+from cpjax.linear.margins import (
+    Margins,
+    characteristic_polynomial,
+    closed_loop_poles,
+    loop_polynomials,
+    stability_margins,
+)
 
 MARGINS = ("gain_lower", "gain_upper", "phase", "delay", "disk")
 PAPERS_LOOPS = [(plant, design) for plant in paper.PLANTS for design in paper.PRINTED_GAINS]
@@ -113,7 +119,7 @@ def from_a_grid(A, B, K):
 @the_papers_loops
 def test_the_papers_loops_have_python_controls_margins(plant, design):
     loop = papers_loop(plant, design)
-    found, expected = numbers(margins(*loop)), python_controls(*loop)
+    found, expected = numbers(stability_margins(*loop)), python_controls(*loop)
     assert found["stable"]
     for name, value in expected.items():
         assert found[name] == pytest.approx(value, rel=1e-9), name
@@ -127,7 +133,7 @@ def test_the_papers_loops_have_python_controls_margins(plant, design):
 @pytest.mark.parametrize("n", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 6))])
 def test_random_loops_have_python_controls_margins(n):
     for loop in random_loops(n, 40):
-        found = numbers(margins(*loop))
+        found = numbers(stability_margins(*loop))
         for name, value in python_controls(*loop).items():
             assert found[name] == pytest.approx(value, rel=1e-6), (name, loop)
 
@@ -135,7 +141,7 @@ def test_random_loops_have_python_controls_margins(n):
 @the_papers_loops
 def test_the_disk_margins_are_python_controls(plant, design):
     A, B, K = papers_loop(plant, design)
-    found = numbers(margins(A, B, K))
+    found = numbers(stability_margins(A, B, K))
     system = control.ss(A, B[:, None], K[None, :], 0)
     grid = np.sort(np.append(np.geomspace(1e-2, 1e4, 500), found["disk_frequency"]))
     alpha, gain, phase = control.disk_margins(system, grid)
@@ -148,7 +154,7 @@ def test_the_disk_margins_are_python_controls(plant, design):
 @rows("n", [2, 4, 6])
 def test_no_margin_of_a_random_loop_is_missed_that_a_dense_grid_finds(n):
     for loop in random_loops(n, 25, seed=1):
-        found = numbers(margins(*loop))
+        found = numbers(stability_margins(*loop))
         for name, value in from_a_grid(*loop).items():
             assert found[name] == pytest.approx(value, rel=1e-9), (name, loop)
 
@@ -158,7 +164,7 @@ def test_a_resonance_is_found_however_narrow_it_is(damping):
     """Two oscillators, of which the faster one has |L| > 1 over a band of the width of its damping."""
     A = np.array([[0, 1, 0, 0], [-1, -0.5, 0, 0], [0, 0, 0, 1], [0, 0, -1e4, -200 * damping]])
     B, K = np.array([0, 1, 0, 1.0]), np.array([0, 0.1, 0, 300 * damping])
-    found = numbers(margins(A, B, K))
+    found = numbers(stability_margins(A, B, K))
     for name, value in from_a_grid(A, B, K).items():
         assert found[name] == pytest.approx(value, rel=1e-7), name
     assert abs(found["phase_frequency"] - 100.0) < 1000 * damping + 1e-2
@@ -170,7 +176,7 @@ def test_an_lqr_loop_has_the_margins_that_every_lqr_loop_has():
             rng = np.random.default_rng([seed, n])
             A, B, R = rng.normal(size=(n, n)), rng.normal(size=(n, 1)), 10.0 ** rng.uniform(-3.0, 2.0)
             K = (B.T @ solve_continuous_are(A, B, np.eye(n), [[R]]))[0] / R
-            found = numbers(margins(A, B, K))
+            found = numbers(stability_margins(A, B, K))
             assert found["gain_lower"] < 0.5
             assert found["gain_upper"] == math.inf
             assert found["phase"] > math.pi / 3
@@ -193,7 +199,7 @@ every_loop = rows("loop", LOOPS.values(), ids=LOOPS.keys())
 
 
 def test_these_loops_have_between_them_every_kind_of_gain_margin():
-    found = {name: numbers(margins(*loop)) for name, loop in LOOPS.items()}
+    found = {name: numbers(stability_margins(*loop)) for name, loop in LOOPS.items()}
     assert all(found[name]["gain_upper"] == math.inf for name in ("placement", "lqr"))
     assert all(found[name]["gain_lower_frequency"] > 0 for name in ("placement", "lqr"))
     assert found["between gains"]["gain_lower_frequency"] == 0
@@ -204,7 +210,7 @@ def test_these_loops_have_between_them_every_kind_of_gain_margin():
 
 @every_loop
 def test_the_loop_is_stable_between_the_gain_margins_and_not_just_outside(loop):
-    found = margins(*loop)
+    found = stability_margins(*loop)
     lower, upper = float(found.gain_lower), min(float(found.gain_upper), 1e3)
     inside = lower + (upper - lower) * np.linspace(1e-6, 1 - 1e-6, 500)
     assert all(is_stable(*loop, factor) for factor in inside)
@@ -216,14 +222,14 @@ def test_the_loop_is_stable_between_the_gain_margins_and_not_just_outside(loop):
 
 @every_loop
 def test_the_loop_is_stable_for_every_phase_below_the_phase_margin_and_not_above(loop):
-    phase = float(margins(*loop).phase)
+    phase = float(stability_margins(*loop).phase)
     assert all(is_stable(*loop, np.exp(1j * phi)) for phi in phase * np.linspace(-1 + 1e-6, 1 - 1e-6, 201))
     assert not all(is_stable(*loop, np.exp(1j * sign * phase * (1 + 1e-6))) for sign in (-1, 1))
 
 
 @every_loop
 def test_the_loop_is_stable_for_every_delay_below_the_delay_margin_and_not_above(loop):
-    delay = float(margins(*loop).delay)
+    delay = float(stability_margins(*loop).delay)
 
     def delayed_is_stable(time):
         numerator, denominator = control.pade(time, 8)
@@ -241,7 +247,7 @@ def test_the_loop_is_stable_for_every_delay_below_the_delay_margin_and_not_above
 @every_loop
 def test_the_loop_is_stable_for_every_factor_in_the_disk_but_not_on_its_rim(loop):
     A, B, K = loop
-    found = numbers(margins(*loop))
+    found = numbers(stability_margins(*loop))
     rng = np.random.default_rng(0)
     inside = found["disk"] * np.sqrt(rng.uniform(0, 1, 300)) * np.exp(1j * rng.uniform(0, math.tau, 300))
     rim = found["disk"] * (1 - 1e-6) * np.exp(1j * np.linspace(0, math.tau, 200))
@@ -266,7 +272,7 @@ NOTHING = math.nan
 def test_an_unstable_lag_of_loop_gain_two_has_its_textbook_margins():
     """L = 2 / (s - 1)."""
     expect(
-        margins([[1.0]], [1.0], [2.0]),
+        stability_margins([[1.0]], [1.0], [2.0]),
         gain_lower=0.5,
         gain_lower_frequency=0.0,
         gain_upper=math.inf,
@@ -283,7 +289,7 @@ def test_an_unstable_lag_of_loop_gain_two_has_its_textbook_margins():
 def test_an_integrator_has_its_textbook_margins():
     """L = 2 / s lies in the right half plane and meets the disk of radius 1 nowhere."""
     expect(
-        margins([[0.0]], [1.0], [2.0]),
+        stability_margins([[0.0]], [1.0], [2.0]),
         gain_lower=0.0,
         gain_lower_frequency=NOTHING,
         gain_upper=math.inf,
@@ -301,7 +307,7 @@ def test_a_double_integrator_has_its_textbook_margins():
     """L = (s + 1) / s^2, with |L| = 1 where w^4 = w^2 + 1."""
     w = math.sqrt((1 + math.sqrt(5)) / 2)
     expect(
-        margins([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 1.0]),
+        stability_margins([[0.0, 1.0], [0.0, 0.0]], [0.0, 1.0], [1.0, 1.0]),
         gain_lower=0.0,
         gain_upper=math.inf,
         phase=math.atan(w),
@@ -313,26 +319,26 @@ def test_a_double_integrator_has_its_textbook_margins():
 def test_a_gain_that_acts_on_no_derivative_has_the_upper_margin_of_routh():
     """L = 1 / (s (s + 1) (s + 2)), whose K B is exactly 0."""
     A = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -2.0, -3.0]]
-    found = margins(A, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    found = stability_margins(A, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
     expect(found, gain_lower=0.0, gain_upper=6.0, gain_upper_frequency=math.sqrt(2))
 
 
 def test_four_equal_closed_loop_poles_are_no_obstacle():
     """Of L = (4 s^3 + 6 s^2 + 4 s + 1) / s^4 the factor 1/5 leaves (s^2 + 1)(5 s^2 + 4 s + 1) / 5."""
-    found = margins(np.diag(np.ones(3), 1), [0.0, 0.0, 0.0, 1.0], [1.0, 4.0, 6.0, 4.0])
+    found = stability_margins(np.diag(np.ones(3), 1), [0.0, 0.0, 0.0, 1.0], [1.0, 4.0, 6.0, 4.0])
     expect(found, gain_lower=0.2, gain_lower_frequency=1.0, gain_upper=math.inf)
 
 
 def test_positive_feedback_on_a_stable_plant_is_limited_at_frequency_zero():
     """L = -1 / (s^2 + s / 10 + 4): at a factor of 4 a real pole reaches 0."""
-    found = margins([[0.0, 1.0], [-4.0, -0.1]], [0.0, 1.0], [-1.0, 0.0])
+    found = stability_margins([[0.0, 1.0], [-4.0, -0.1]], [0.0, 1.0], [-1.0, 0.0])
     expect(found, gain_lower=0.0, gain_upper=4.0, gain_upper_frequency=0.0)
 
 
 def test_a_plant_with_poles_on_the_axis_has_finite_margins():
     """L = s / (s^2 + 4), infinite at 2 rad/s and always in the right half plane."""
     crossovers = [(math.sqrt(17) - 1) / 2, (math.sqrt(17) + 1) / 2]
-    found = margins([[0.0, 1.0], [-4.0, 0.0]], [0.0, 1.0], [0.0, 1.0])
+    found = stability_margins([[0.0, 1.0], [-4.0, 0.0]], [0.0, 1.0], [0.0, 1.0])
     expect(found, gain_lower=0.0, gain_upper=math.inf, phase=math.pi / 2, disk=2.0)
     # Below the resonance L leads by a quarter turn, and only a lag of three quarters destabilises.
     expect(found, delay=math.pi / 2 / crossovers[1], delay_frequency=crossovers[1])
@@ -343,7 +349,7 @@ def test_a_plant_with_poles_on_the_axis_has_finite_margins():
 
 @rows(("B", "K"), [([1.0, 1.0], [0.0, 0.0]), ([0.0, 0.0], [1.0, 1.0])])
 def test_without_feedback_nothing_limits_a_stable_plant(B, K):
-    found = margins([[-1.0, 0.0], [1.0, -2.0]], B, K)
+    found = stability_margins([[-1.0, 0.0], [1.0, -2.0]], B, K)
     expect(found, gain_lower=0.0, gain_upper=math.inf, phase=math.inf, delay=math.inf, disk=2.0, disk_gain=math.inf)
     for name in ("gain_lower", "gain_upper", "phase", "delay"):
         assert math.isnan(getattr(found, f"{name}_frequency"))
@@ -351,7 +357,7 @@ def test_without_feedback_nothing_limits_a_stable_plant(B, K):
 
 def test_of_an_unstable_loop_all_margins_are_nan_with_finite_derivatives():
     A, B, K = papers_loop("appendix", "placement")
-    found = margins(A, B, -K)
+    found = stability_margins(A, B, -K)
     assert not found.stable
     assert all(math.isnan(value) for value in found[1:])
     jacobian, _ = reverse(tuple(map(jnp.asarray, (A, B, -K))))
@@ -361,10 +367,10 @@ def test_of_an_unstable_loop_all_margins_are_nan_with_finite_derivatives():
 @the_papers_loops
 def test_the_margins_depend_neither_on_the_units_of_the_states_nor_on_that_of_time(plant, design):
     A, B, K = papers_loop(plant, design)
-    plain = numbers(margins(A, B, K))
+    plain = numbers(stability_margins(A, B, K))
     units = np.array([1e3, 1e-2, 57.3, 7.0])
-    rescaled = numbers(margins(A * units[:, None] / units, B * units, K / units))
-    faster = numbers(margins(50.0 * A, 50.0 * B, K))
+    rescaled = numbers(stability_margins(A * units[:, None] / units, B * units, K / units))
+    faster = numbers(stability_margins(50.0 * A, 50.0 * B, K))
     for name, value in plain.items():
         times = 50.0 if name.endswith("frequency") else 1 / 50.0 if name == "delay" else 1.0
         assert rescaled[name] == pytest.approx(value, rel=1e-9, nan_ok=True), name
@@ -375,7 +381,7 @@ def test_poles_four_decades_apart_and_gains_of_ten_millions_leave_eight_digits()
     A, B = (np.asarray(matrix) for matrix in cpjax.linearize(paper.appendix_plant()))
     for poles in ([-1.0, -40.0, -600.0, -1e4], [-2.0, -3.0, -5e3, -1e4]):
         K = place_poles(A, B, poles).gain_matrix[0]
-        found = numbers(margins(A, B[:, 0], K))
+        found = numbers(stability_margins(A, B[:, 0], K))
         for name, value in from_a_grid(A, B[:, 0], K).items():
             assert found[name] == pytest.approx(value, rel=1e-8), (name, poles)
 
@@ -383,8 +389,8 @@ def test_poles_four_decades_apart_and_gains_of_ten_millions_leave_eight_digits()
 @the_papers_loops
 def test_float32_gives_the_papers_margins_to_four_digits_in_float32(plant, design):
     loop = papers_loop(plant, design)
-    narrow = margins(*(jnp.asarray(matrix, dtype=jnp.float32) for matrix in loop))
-    for name, value in numbers(margins(*loop)).items():
+    narrow = stability_margins(*(jnp.asarray(matrix, dtype=jnp.float32) for matrix in loop))
+    for name, value in numbers(stability_margins(*loop)).items():
         found = getattr(narrow, name)
         assert found.dtype == (jnp.bool if name == "stable" else jnp.float32)
         assert float(found) == pytest.approx(value, rel=1e-4, nan_ok=True), name
@@ -396,7 +402,7 @@ def vector(found: Margins):
 
 @jax.jit
 def forward(loop, direction):
-    return jax.jvp(lambda loop: vector(margins(*loop)), (loop,), (direction,))[1]
+    return jax.jvp(lambda loop: vector(stability_margins(*loop)), (loop,), (direction,))[1]
 
 
 @jax.jit
@@ -404,7 +410,7 @@ def reverse(loop):
     """Jacobians in A, B and K, and the margins."""
 
     def twice(loop):
-        values = vector(margins(*loop))
+        values = vector(stability_margins(*loop))
         return values, values
 
     return jax.jacrev(twice, has_aux=True)(loop)
@@ -439,7 +445,7 @@ def test_every_finite_margins_derivative_agrees_with_differences(loop):
         back = sum(jnp.tensordot(part, d, d.ndim) for part, d in zip(jacobian, direction, strict=True))
 
         def moved(h, direction=direction):
-            return vector(margins(*(m + h * d for m, d in zip(loop, direction, strict=True))))[finite]
+            return vector(stability_margins(*(m + h * d for m, d in zip(loop, direction, strict=True))))[finite]
 
         ahead, back, differences = ahead[finite], back[finite], richardson(moved, 1e-4)
         scale = np.maximum(np.abs(ahead), np.abs(values[finite]))
@@ -480,11 +486,11 @@ def test_second_derivatives_are_those_of_the_first():
     direction = jnp.asarray([1.0, -2.0, 3.0, 1.0])
 
     def slopes(h):
-        return jax.jacfwd(lambda h: vector(margins(A, B, K + h * direction)))(h)
+        return jax.jacfwd(lambda h: vector(stability_margins(A, B, K + h * direction)))(h)
 
     curvature = jax.jit(jax.jacfwd(slopes))(0.0)
     expected = richardson(jax.jit(slopes), 1e-2)
-    finite = np.isfinite(vector(margins(A, B, K)))
+    finite = np.isfinite(vector(stability_margins(A, B, K)))
     np.testing.assert_allclose(curvature[finite], expected[finite], rtol=1e-6, atol=1e-9)
 
 
@@ -575,7 +581,7 @@ def test_the_loops_polynomials_are_python_controls_and_add_up_to_the_closed_loop
     ],
 )
 def test_what_is_no_loop_is_refused_by_name(field, loop):
-    for function in (margins, loop_polynomials):
+    for function in (stability_margins, loop_polynomials):
         with pytest.raises(InputError) as refusal:
             function(*loop)
         assert refusal.value.field == field
