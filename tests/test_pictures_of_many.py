@@ -1,9 +1,13 @@
 """The commands that map, trade off and animate: what they write, and what they refuse."""
 
+import base64
+import io
 import json
+import re
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from tables import rows
 
@@ -61,17 +65,51 @@ def test_animate_draws_as_many_pictures_as_it_says_in_each_controllers_colour(co
         assert np.min(np.abs(part - wanted).sum(axis=2)) < 40, design
 
 
-def test_an_animation_as_a_page_holds_the_runs_and_asks_for_nothing(command, tmp_path):
+@pytest.fixture(scope="module")
+def run():
+    """0.5 s of a swing-up from hanging."""
+    plant = cpjax.paper.appendix_plant()
+    return cpjax.rollout(plant, cpjax.preset("lqr"), cpjax.HANGING, duration=0.5, dt=0.002, clock="sampled")
+
+
+def test_an_animation_as_a_page_holds_its_pictures_and_asks_for_nothing(command, tmp_path):
     assert command("animate", "--format", "html", "--duration", 0.5, "--out", tmp_path).code == 0
     page = (tmp_path / "animation.html").read_text()
     assert "http" not in page
     assert "url(" not in page
-    data = json.loads(page.split("const data = ")[1].split(";\n")[0])
-    assert [scene["title"] for scene in data["scenes"]] == ["paper, corrected, LQR", "tuned, LQR"]
-    plant = cpjax.paper.appendix_plant()
-    run = cpjax.rollout(plant, cpjax.preset("lqr"), cpjax.HANGING, duration=0.5, dt=0.002, clock="sampled")
-    np.testing.assert_allclose(data["scenes"][1]["theta"], np.asarray(run.state.theta)[::25], atol=1e-4)
-    np.testing.assert_allclose(data["scenes"][1]["voltage"], np.asarray(run.voltage)[::25], atol=1e-3)
+    assert "<link" not in page
+    assert "<title>paper, corrected, LQR | tuned, LQR</title>" in page
+    sources = re.findall(r'frames\[(\d+)\] = "data:image/png;base64,([^"]+)"', page)
+    assert [int(number) for number, _ in sources] == list(range(11))
+    pictures = [Image.open(io.BytesIO(base64.b64decode(data.replace("\\\n", "")))) for _, data in sources]
+    assert len({picture.size for picture in pictures}) == 1
+    assert len({picture.tobytes() for picture in pictures}) == 11
+    names = re.findall(r' id="([^"]*)"', page)
+    assert len(names) == len(set(names))
+    for used in re.findall(r'class="fa ([\w-]+)', page):
+        assert f".{used}::before {{" in page  # the letter on its button
+    assert "anim = new Animation(" in page
+    assert "anim.play_animation()" in page
+
+
+def test_a_page_keeps_time_and_equal_runs_write_equal_pages(tmp_path, run):
+    scene = animation.Scene("<b> & $x$", "black", run, 0.7, np.inf)
+    for name in ("one.html", "two.html"):
+        animation.save_animation(tmp_path / name, [scene], duration=0.5, rate=30.0)
+    page = (tmp_path / "one.html").read_text()
+    assert page == (tmp_path / "two.html").read_text()
+    assert "<title>&lt;b&gt; &amp; $x$</title>" in page
+    # Browsers count in whole milliseconds: a picture every 33 ms, of what happened every 33 ms.
+    assert re.search(r"new Animation\(frames, img_id, slider_id, ([^,]+),", page)[1] == "33"
+    assert page.count("data:image/png") == 16  # at 0, 33, ..., 495 ms
+
+
+def test_a_page_that_would_lack_pictures_is_refused(command, tmp_path, monkeypatch):
+    monkeypatch.setattr(animation, "_LARGEST_PAGE", 0.1)
+    done = command("animate", "--format", "html", "--duration", 0.5, "--out", tmp_path)
+    assert done.code == 2
+    assert "at a lower rate or with fewer controllers" in done.err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_gif_keeps_time_and_has_the_colours_of_what_comes_later(command, tmp_path):
@@ -92,8 +130,9 @@ def test_a_gif_keeps_time_and_has_the_colours_of_what_comes_later(command, tmp_p
 @pytest.mark.parametrize(
     ("script", "code", "words"),
     [
-        ('for last; do :; done; cat > "$last"', 0, "animation.mp4"),
-        ("echo no such codec >&2; exit 3", 2, "no such codec"),
+        ('echo "$@" > "$0.asked"; for last; do :; done; cat > "$last"', 0, "animation.mp4"),
+        ("echo no such codec >&2; exit 3", 2, "ended with exit code 3, saying no such codec"),
+        ("exec 0<&-", 2, "ended with exit code 0, saying nothing"),
     ],
 )
 def test_a_film_is_what_the_encoder_makes_of_the_pictures_or_what_it_says(
@@ -108,22 +147,48 @@ def test_a_film_is_what_the_encoder_makes_of_the_pictures_or_what_it_says(
     assert words in done.out + done.err
     film = tmp_path / "film" / "animation.mp4"
     assert film.exists() == (code == 0)
-    if code == 0:  # the stub writes down what it was given: three pictures
-        assert film.stat().st_size % 9 == 0
+    if code == 0:  # the stub writes down what it was given: three pictures of four bytes per pixel
+        asked = (tmp_path / "encoder.asked").read_text()
+        width, height = map(int, re.search(r"-s (\d+)x(\d+) ", asked).groups())
+        assert width % 2 == height % 2 == 0  # most players require it, and this format
+        assert "-pix_fmt yuv420p" in asked
+        assert "-framerate 10.0 " in asked
+        assert film.stat().st_size == 3 * 4 * width * height
 
 
-def test_the_pole_is_drawn_where_the_plants_coordinates_have_its_bob():
-    from matplotlib.figure import Figure
+@pytest.mark.parametrize("kind", ["gif", "mp4", "html"])
+def test_an_interrupted_animation_is_one_and_leaves_no_file(tmp_path, monkeypatch, run, kind):
+    program = tmp_path / "encoder"
+    program.write_text("#!/bin/bash\ncat > /dev/null; exit 255\n")  # as ffmpeg, interrupted from the same terminal
+    program.chmod(0o755)
+    monkeypatch.setattr(animation, "encoder", lambda: str(program))
+    scene = animation.Scene("", "black", run, 0.7, 12.0)
+    with pytest.raises(KeyboardInterrupt):
+        animation.save_animation(tmp_path / f"film.{kind}", [scene], duration=0.5, report=stop)
+    assert list(tmp_path.iterdir()) == [program]
 
-    plant = cpjax.paper.appendix_plant()
-    run = cpjax.rollout(plant, cpjax.preset("lqr"), cpjax.HANGING, duration=0.1, dt=0.002, clock="sampled")
+
+def test_the_pole_is_drawn_where_the_plants_coordinates_have_its_bob(run):
+    instants = np.arange(11) / 20
+    stage = animation._Stage(Figure().subplots(), animation.Scene("", "black", run, 0.7, 12.0), 2.0, instants)
+    x, theta, voltage = (np.asarray(one)[::25] for one in (run.state.x, run.state.theta, run.voltage))
+    assert np.ptp(x) > 0.1
+    tips = np.stack([x - 0.7 * np.sin(theta), 0.7 * np.cos(theta)])  # x - l sin(theta), as cpjax.State says
+    for i in (0, 4, 10, 7):  # in any order
+        stage.draw(i)
+        np.testing.assert_allclose(np.ravel(stage._bob.get_data()), tips[:, i])
+        np.testing.assert_allclose(stage._pole.get_data(), np.stack([[x[i], 0.0], tips[:, i]]).T)
+        np.testing.assert_allclose(stage._trail.get_data(), tips[:, : i + 1])  # of 0.6 s at most
+        assert stage._cart.get_center() == pytest.approx((x[i], 0.0))
+        assert stage._bar.get_width() == pytest.approx(0.8 * 2.0 * voltage[i] / 12.0)
+        assert stage._text.get_text() == f"swing up   {voltage[i]:+5.1f} V"
+
+
+def test_a_trail_has_the_last_six_tenths_of_a_second(run):
     axes = Figure().subplots()
-    stage = animation._Stage(axes, animation.Scene("", "black", run, 0.7, 12.0), 2.0)
-    stage.draw(0.3, 0.5, 0.0, 0, 5)
-    assert stage._bob.get_data()[0][0] == pytest.approx(
-        0.3 - 0.7 * np.sin(0.5)
-    )  # x - l sin(theta), as cpjax.State says
-    assert animation._PAGE.count("- L * Math.sin(") == 2
+    stage = animation._Stage(axes, animation.Scene("", "black", run, 0.7, 12.0), 2.0, np.arange(101) / 100)
+    stage.draw(90)
+    assert stage._trail.get_xdata().shape == (60,)
 
 
 def test_without_an_encoder_a_film_becomes_a_page(command, tmp_path, monkeypatch):
@@ -141,6 +206,7 @@ def test_without_an_encoder_a_film_becomes_a_page(command, tmp_path, monkeypatch
         (("basin", "--theta-dot", "nan", "1"), "error: theta-dot = "),
         (("animate", "--controllers", "tuned_lqr", "tuned_lqr"), "controllers"),
         (("animate", "--rate", "60"), "rate"),
+        (("animate", "--format", "html", "--rate", "100", "--duration", "15.1"), "15 s for html at this rate, 1500"),
         (("basin", "--across", "x", "--up", "x"), "up"),
         (("basin", "--cells", "0"), "cells"),
         (("basin", "--controllers", "corrected/nothing"), "controller"),

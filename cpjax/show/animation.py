@@ -16,6 +16,7 @@ from matplotlib.animation import FFMpegWriter, FuncAnimation, HTMLWriter, Pillow
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Rectangle
 from PIL import Image
 
@@ -153,7 +154,7 @@ class _Stage:
 def _animation(scenes: Sequence[Scene], duration: float, instants: np.ndarray[Any, Any]) -> FuncAnimation:
     half = _half_width(scenes, duration)
     height = 3.9 * 1.55 * max(scene.length for scene in scenes) / half + 1.25  # axes 3.9 in wide
-    figure = Figure(figsize=(4.2 * len(scenes), max(2.6, height)), layout="constrained")
+    figure = Figure(figsize=(4.2 * len(scenes), max(2.6, height)))
     panels = figure.subplots(1, len(scenes), squeeze=False)[0]
     stages = [_Stage(axes, scene, half, instants) for axes, scene in zip(panels, scenes, strict=True)]
     title = figure.suptitle("", fontsize="medium")
@@ -165,8 +166,8 @@ def _animation(scenes: Sequence[Scene], duration: float, instants: np.ndarray[An
         return []  # what moved, which only a window wants to know
 
     draw(0)
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # all pictures keep the layout of the first
+    ConstrainedLayoutEngine().execute(figure)  # once: all pictures keep the layout of the first
+    figure.set_layout_engine("none")  # not even one of the user's matplotlibrc
     return FuncAnimation(figure, draw, frames=len(instants), cache_frame_data=False)
 
 
@@ -227,8 +228,8 @@ def _page(player: str, scenes: Sequence[Scene], count: int) -> str:
         allowed = f"less, at a lower rate or with fewer controllers: the page would have more than {_LARGEST_PAGE} MiB"
         raise InputError("duration", f"{count} pictures", allowed)
     player = re.sub(r"<link[^>]*>", "", player)  # a font of icons
-    name = re.search(r'id="_anim_img(\w+)"', player)
-    player = player.replace(name[1], "") if name else player  # at random: equal runs would write unequal files
+    for name in re.findall(r'id="_anim_img(\w+)"', player):
+        player = player.replace(name, "")  # at random: equal runs would write unequal files
     return _PAGE.replace("TITLE", html.escape(" | ".join(s.title for s in scenes))).replace("PLAYER", player)
 
 
