@@ -40,8 +40,8 @@ OPTIONS = [
 def add_command(commands: Any) -> None:
     """Declares the command."""
     text = (
-        "Shows controllers swinging the pendulum up from one start, in real time: cart, pole, trail, voltage and mode. "
-        "Writes animation.gif (.mp4, .html) and animation.json."
+        "Shows controllers swinging the pendulum up from one initial state, in real time: cart, pole, trail, "
+        "voltage and mode. Writes animation.gif (.mp4, .html) and animation.json."
     )
     parser = commands.add_parser("animate", help="runs as a moving picture", description=text)
     add_options(parser, OPTIONS, out="out/animate")
@@ -62,14 +62,14 @@ def run(given: argparse.Namespace) -> int:
     notes = notes_on(sections["plant"], plant, controllers)
     announce("animate", notes)
     start = build_start(sections["start"], given.seed)
-    path, runs = animated(given.out, plant, controllers, start, chosen, seed=given.seed, notes=notes)
+    path, runs = run_animation(given.out, plant, controllers, start, chosen, seed=given.seed, notes=notes)
     for name, one in runs.items():
         say(f"{controller_title(name)}: {verdict(one, chosen['duration'])}")
     say(f"wrote {path} and animation.json")
     return 0
 
 
-def animated(
+def run_animation(
     out: Path,
     plant: CartPole,
     controllers: Mapping[str, Hybrid],

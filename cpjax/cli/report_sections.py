@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 from cpjax import files, paper
 from cpjax.cli import basin, pareto
-from cpjax.cli.animate import animated, verdict
+from cpjax.cli.animate import run_animation, verdict
 from cpjax.cli.audit_gradients import run_audit
 from cpjax.cli.builders import controller_title, named_hybrid
 from cpjax.cli.progress import progress
@@ -196,7 +196,7 @@ def animation(page: Page, given: argparse.Namespace) -> None:
     """Adds an animation of the paper's controller and the tuned one."""
     plant = paper.appendix_plant()
     controllers = {name: named_hybrid(name, plant) for name in ("corrected/lqr", "tuned_lqr")}
-    path, runs = animated(
+    path, runs = run_animation(
         given.out, plant, controllers, HANGING, {"format": "gif", "duration": 6.0, "rate": 20.0}, seed=given.seed
     )
     page.picture(
