@@ -160,3 +160,71 @@ def test_a_package_exports_its_public_names(name):
         thing = getattr(package, public)
         assert not isinstance(thing, types.ModuleType), f"{name}.{public} is a module: a submodule has its name"
         assert not inspect.isroutine(thing) or thing.__doc__, public
+
+
+TYPED = ("linear", "numeric", "plant", "controllers")
+SHAPED = {"Bool", "Complex", "Float", "Int", "Int32", "Num", "Real"}
+"""jaxtyping's types, which state a dtype and, in their brackets, a shape."""
+NO_ARRAY = {
+    "numeric/small_matrices.py: batch_last.function": "a function of any arrays",
+    "numeric/small_matrices.py: batch_last": "as above",
+    "plant/cartpole.py: rod.others": "numbers and a motor, by name",
+    "plant/initial_states.py: sample_starts.dtype": "a dtype, in each form that NumPy takes",
+    "plant/initial_states.py: check_starts.name": "an argument of a user, not known to be a text",
+    "plant/initial_states.py: check_starts.count": "as above",
+    "plant/initial_states.py: check_starts.seed": "as above",
+    "controllers/feedback.py: without_design.controller": "a controller, any pytree",
+    "controllers/feedback.py: without_design": "as above",
+    "controllers/protocol.py: init.measurement": "what a sensor returns, any pytree",
+    "controllers/protocol.py: init": "a controller's memory, any pytree",
+    "controllers/protocol.py: update.memory": "as above",
+    "controllers/protocol.py: update.measurement": "what a sensor returns, any pytree",
+    "controllers/protocol.py: update": "a controller's memory, any pytree",
+    "controllers/protocol.py: modes_in.memory": "as above",
+    "controllers/protocol.py: at_period.controller": "a controller, any pytree",
+    "controllers/protocol.py: at_period": "as above",
+    "controllers/protocol.py: is_clocked.controller": "as above",
+    "controllers/protocol.py: as_controller.controller": "as above",
+    "controllers/protocol.py: as_controller": "as above",
+    "controllers/protocol.py: as_sampled.controller": "as above",
+}
+"""Annotations with a bare Any that are for something else than an array, and what they are for."""
+
+
+def annotations(tree):
+    """Name and annotation of everything public in a module: arguments, results (by the function's name) and fields."""
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            yield from (
+                (f"{node.name}.{field.target.id}", field.annotation)
+                for field in node.body
+                if isinstance(field, ast.AnnAssign)
+            )
+            yield from annotations(ast.Module([part for part in node.body if isinstance(part, ast.FunctionDef)], []))
+        elif isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs, node.args.vararg, node.args.kwarg]
+            yield from ((f"{node.name}.{one.arg}", one.annotation) for one in given if one and one.annotation)
+            if node.returns:
+                yield node.name, node.returns
+
+
+def without_shape(annotation):
+    """Names of arrays, and Any, in an annotation outside the brackets of jaxtyping's types."""
+    if isinstance(annotation, ast.Subscript) and getattr(annotation.value, "id", None) in SHAPED:
+        return
+    name = getattr(annotation, "id", getattr(annotation, "attr", None))
+    if name in ("Any", "Array", "ArrayLike", "JaxOrNumpy", "MatrixLike", "ndarray"):
+        yield name
+    for part in ast.iter_child_nodes(annotation):
+        yield from without_shape(part)
+
+
+def test_public_arrays_have_shape_and_dtype_in_their_types():
+    bare = {
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in SOURCES
+        if layer_of(path) in TYPED and not path.name.startswith("_")
+        for name, annotation in annotations(ast.parse(path.read_text()))
+        if list(without_shape(annotation))
+    }
+    assert bare <= set(NO_ARRAY)

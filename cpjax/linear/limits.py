@@ -158,7 +158,7 @@ def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -
         point = jnp.stack([angle, rate * cos])
         return point @ form @ point
 
-    def narrowed(_: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def narrowed(_: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         middle, width = carry
         positions = middle + width * jnp.linspace(-1.0, 1.0, 129, dtype=shadow.dtype)
         return positions[jnp.argmin(jax.vmap(lambda position: level(position, *fixed))(positions))], width / 64.0
