@@ -93,7 +93,9 @@ def pytree(cls: type[T]) -> type[T]:
     jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
     fields = dataclasses.fields(made)
     _COMPONENTS[made] = tuple(
-        f.name for f in fields if RULE not in f.metadata and f.type in (Scalar, Scalars, float, "Scalar", "float")
+        f.name
+        for f in fields
+        if RULE not in f.metadata and f.type in (Scalar, Scalars, float, "Scalar", "Scalars", "float")
     )
     return made
 
@@ -101,8 +103,8 @@ def pytree(cls: type[T]) -> type[T]:
 def check(name: str, tree: Any, batch: int | None = None) -> list[bool]:
     """Refuses a component that no rollout can run, because JAX may have rebuilt it with arbitrary leaves.
 
-    Fields with a declared rule, and those annotated as `Scalar`, are checked against it. Everything else that a user's
-    own component holds (arrays of any shape, trees of them, functions) is accepted as it is.
+    Fields with a declared rule, and those annotated as `Scalar` or `Scalars`, are checked against it. Everything else
+    that a user's own component holds (arrays of any shape, trees of them, functions) is accepted as it is.
 
     Args:
       name: the component's name in error messages.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     MatrixLike: TypeAlias = ArrayLike | Sequence[Sequence[float]] | Sequence[float]
 else:
     MatrixLike = ArrayLike  # a list has no shape that a type could state
-"""An array, a nested list or a number; with its axes in a signature, as in `Real[MatrixLike, "n n"]`."""
+"""An array, a nested list or a number, as in `Real[MatrixLike, "n n"]`; checkers at run time know no lists."""
 
 
 def matrices(**given: Real[MatrixLike, "..."]) -> list[Float[Array, "..."]]:

@@ -54,7 +54,10 @@ def care(
     R: Real[MatrixLike, "m m"] | Scalar,
     N: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"] | None = None,
 ) -> Float[Array, "n n"]:
-    """Returns P of the continuous-time algebraic Riccati equation; see `solve_care`."""
+    """Returns P of the continuous-time algebraic Riccati equation.
+
+    Takes and raises what `solve_care` does.
+    """
     return solve_care(A, B, Q, R, N).P
 
 
@@ -65,7 +68,10 @@ def dare(
     R: Real[MatrixLike, "m m"] | Scalar,
     N: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"] | None = None,
 ) -> Float[Array, "n n"]:
-    """Returns P of the discrete-time algebraic Riccati equation; see `solve_dare`."""
+    """Returns P of the discrete-time algebraic Riccati equation.
+
+    Takes and raises what `solve_dare` does.
+    """
     return solve_dare(A, B, Q, R, N).P
 
 

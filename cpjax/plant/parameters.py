@@ -15,7 +15,7 @@ def parameters_of(plant: CartPole) -> dict[str, Number]:
 
 
 def parameter(plant: CartPole, name: str) -> Scalars:
-    """Returns the value of a number of the plant or of its motor."""
+    """Returns the value of a number of the plant or of its motor, in the unit of its declaration."""
     value: Scalars = getattr(plant if name in numbers(type(plant)) else plant.motor, name)
     return value
 

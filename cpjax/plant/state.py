@@ -47,7 +47,11 @@ class State:
 
 
 def deviation(state: State, reference: State) -> tuple[Scalars, Scalars, Scalars, Scalars]:
-    """Returns `state` minus `reference` in the order of `NAMES`, with the angle difference wrapped to [-pi, pi]."""
+    """Returns `state` minus `reference` in the order of `NAMES`, with the angle difference wrapped to [-pi, pi].
+
+    Args:
+      state, reference: either may be a batch of states.
+    """
     return (
         state.x - reference.x,
         state.x_dot - reference.x_dot,
@@ -61,6 +65,7 @@ def checked_reference(field: str, reference: State) -> State:
 
     Args:
       field: name of the parameter in error messages.
+      reference: the parameter.
 
     Raises:
       InputError: a component that is not a finite number.
