@@ -93,7 +93,7 @@ def _with_derivatives(
 def linearised(
     prints: tuple[PrintedGain, ...], plant: CartPole
 ) -> tuple[Float[np.ndarray, " residuals"], Float[np.ndarray, "residuals parameters"]]:
-    """Returns the residuals on `plant` and their derivatives by all `PARAMETERS`, as NumPy arrays."""
+    """Returns the residuals on `plant`, four for each gain, and their derivatives by all `PARAMETERS`."""
     r, J = _compiled_linearisation(prints, *_numbers(plant))
     return np.asarray(r), np.asarray(J)
 

@@ -51,8 +51,8 @@ _STEPS = 1e-3 * 4.0 ** -np.arange(7)
 Derivatives: TypeAlias = Float[np.ndarray, "starts horizons parameters"]
 """Derivatives of the objective with respect to relative changes of the parameters."""
 
-Verdicts: TypeAlias = Bool[np.ndarray, "starts horizons parameters"]
-"""Whether something is so, of each of the `Derivatives`."""
+Mask: TypeAlias = Bool[np.ndarray, "starts horizons parameters"]
+"""Which of the `Derivatives` have a property."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,13 +100,13 @@ class GradientAudit:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(distance == 0.0, 0.0 * size, distance / np.maximum(size, SMALL_SHARE * self._largest()))
 
-    def wrong_signs(self, gradient: Derivatives) -> Verdicts:
+    def wrong_signs(self, gradient: Derivatives) -> Mask:
         """Returns where the gradient's sign (-1, 0, 1) differs from the difference's, if that is certain."""
         known = np.abs(self.difference) > np.maximum(self.uncertainty, SMALL_SHARE * self._largest())
         return known & (np.sign(gradient) != np.sign(self.difference))
 
     @property
-    def resolved(self) -> Verdicts:
+    def resolved(self) -> Mask:
         """Whether the differences are certain to `RESOLUTION`.
 
         Next to a kink (a crossing that appears or vanishes with a small step of a parameter) only the smallest stencils
@@ -114,7 +114,7 @@ class GradientAudit:
         """
         with np.errstate(invalid="ignore"):
             size = np.maximum(np.abs(self.difference), SMALL_SHARE * self._largest())
-            resolved: Verdicts = self.uncertainty <= RESOLUTION * size
+            resolved: Mask = self.uncertainty <= RESOLUTION * size
             return resolved
 
     def _largest(self) -> Float[np.ndarray, "starts horizons 1"]:
@@ -130,9 +130,9 @@ class GradientAudit:
         return np.array([kind == "trustworthy" for kind, _ in self.verdicts])
 
     @property
-    def compared(self) -> Verdicts:
+    def compared(self) -> Mask:
         """Which derivatives are compared: of trustworthy initial states, where the difference is resolved."""
-        compared: Verdicts = self.trusted[:, None, None] & self.resolved
+        compared: Mask = self.trusted[:, None, None] & self.resolved
         return compared
 
     @property
@@ -292,7 +292,7 @@ def _differences(
     run = jax.jit(jax.vmap(lambda vector, start: probe(vector, start, "located", None)[0]))
     many = jax.tree.map(lambda column: jnp.repeat(column, 2 * d), starts)
     moves = np.stack([np.eye(d), -np.eye(d)])  # (2, d, d)
-    same: dict[float, Verdicts] = {}
+    same: dict[float, Mask] = {}
 
     def ends(step: float) -> tuple[Derivatives, Derivatives]:
         report(f"differences with steps of {step:.0e}")

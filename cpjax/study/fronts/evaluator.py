@@ -78,7 +78,7 @@ class Evaluated(NamedTuple):
         return self.vectors[found], float(time[found]) if len(within) else math.inf
 
     def epsilon_grid(self, cost: str, plan: FrontConfig) -> Float[np.ndarray, " bounds"]:
-        """Returns bounds on a cost, see `FrontConfig.bounds`; the last one is infinite."""
+        """Returns bounds on a cost, one more than `FrontConfig.bounds`; the last one is infinite."""
         points = self.points(cost, self.threshold(plan.success))
         points = points[np.isfinite(points[:, 0])]
         if not len(points):
