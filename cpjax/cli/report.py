@@ -5,7 +5,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from cpjax import __version__, files, paper
+from cpjax import files, paper
 from cpjax.cli.builders import EVALUATION_OPTIONS
 from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
@@ -73,7 +73,6 @@ def write_report(
     from cpjax.show import comparison
     from cpjax.show.figures import save_figure, success_rates
     from cpjax.show.page import Page
-    from cpjax.show.reproduction import HEADER, cells, findings, pictures
 
     results, shown_start, drawn = run_comparison(given.out, paper.appendix_plant(), setting, {})
     page = Page(
@@ -84,31 +83,9 @@ def write_report(
     page.numbers(comparison.headline(results))
     picture = save_figure(given.out / "success.png", success_rates(rows))
     page.picture(picture, "Share of initial states caught by each law, plant and regulator, with 95 % intervals.")
-    page.section("Setup")
-    page.text(
-        f"{setting.count} initial states from the set `{setting.starts}` (seed {setting.seed}), {setting.duration:g} s "
-        f"each, RK4 with a step of {1000 * setting.dt:g} ms, the control held over a step, the voltage clipped at 12 "
-        "V. A run succeeds if from some moment, at least 1 s before its end, angle and cart stay within 0.05 rad and "
-        "0.05 m of upright and centre."
-    )
-    page.text(
-        "`hanging` initial states lie within 0.3 rad, 0.3 rad/s and 0.1 m of hanging at rest in the middle. The "
-        "`appendix` plant has the paper's printed parameters; the `identified` one those from which its printed gains "
-        "follow. Law `as-printed` has the paper's signs, `corrected` those that its derivation gives, with its gain k "
-        "= 0.2, `corrected-as-voltage` takes the wanted acceleration for a voltage, and `corrected-centred` has k = 5 "
-        "and holds the cart near the middle."
-    )
-    page.section("Results")
-    for sentence in (*findings(rows), comparison.findings(results)[-1]):
-        page.text(sentence)
-    page.table(HEADER, [cells(row) for row in rows], text_columns=4)
-    page.note(
-        "Settling, travel, effort and variation are over the successful runs, the peak voltage over all. "
-        "Every number is in `reproduction.json` beside this page."
-    )
-    page.section("The paper's Figures 3 to 6, from our runs")
-    for name, figure, caption in pictures(setting):
-        page.picture(save_figure(given.out / f"{name}.png", figure), caption)
+    sections_of.setup(page, setting)
+    sections_of.results(page, rows, results)
+    sections_of.paper_figures(page, given, setting)
     sections_of.designs(page, given)
     sections_of.forensics(page, given)
     if studies != "none":
@@ -121,16 +98,6 @@ def write_report(
         sections_of.basins(page, given, parts, per_axis)
     if studies != "none":
         sections_of.fronts(page, given, parts, studies)
-    page.section("How to reproduce this page")
-    page.text(
-        f"`cpjax report --starts {setting.starts} --count {setting.count} --seed {setting.seed} "
-        f"--duration {_shortest(setting.duration)} --dt {_shortest(setting.dt)} --cells {per_axis} "
-        f"--studies {studies}` with cpjax {__version__}."
-    )
+    sections_of.how_to_reproduce(page, setting, per_axis, studies)
     page.write(given.out / "report.html")
     return rows
-
-
-def _shortest(seconds: float) -> str:
-    """Returns the number in six digits if they are exact, else in all of its digits."""
-    return f"{seconds:g}" if float(f"{seconds:g}") == seconds else repr(seconds)

@@ -1,11 +1,11 @@
 """The sections of the report, each from a study that another command does too."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from cpjax import files, paper
+from cpjax import __version__, files, paper
 from cpjax.cli import basin, pareto
 from cpjax.cli.animate import run_animation, verdict
 from cpjax.cli.audit_gradients import run_audit
@@ -16,7 +16,7 @@ from cpjax.controllers import AngleGate
 from cpjax.paper.comparison import Compared
 from cpjax.paper.gain_identification import audit_gains, write
 from cpjax.paper.printed_gains import printed_in_the_paper
-from cpjax.paper.reproduction import DESIGNS
+from cpjax.paper.reproduction import DESIGNS, EvaluationConfig
 from cpjax.plant.state import HANGING
 from cpjax.presets import preset
 from cpjax.show import comparison as comparison_text
@@ -24,6 +24,7 @@ from cpjax.show import design as design_text
 from cpjax.show import front as front_text
 from cpjax.show import gain_identification as identification_text
 from cpjax.show import gradients as gradients_text
+from cpjax.show import reproduction as reproduction_text
 from cpjax.show.figures import DESIGN_NAMES, save_figure
 from cpjax.show.page import Page
 from cpjax.study.design_check import check_design, document
@@ -45,6 +46,48 @@ QUICK_TUNING: Mapping[str, Any] = {"candidates": 1023, "restarts": 4, "batch": 8
 """Fields of a `TuningConfig`."""
 QUICK_AUDIT: Mapping[str, Any] = {"count": 4, "duration": 3.0, "dt": 0.002}
 """Options of `cpjax audit-gradients`."""
+
+
+def setup(page: Page, setting: EvaluationConfig) -> None:
+    """Adds the section on initial states, runs, plants and laws."""
+    page.section("Setup")
+    page.text(
+        f"{setting.count} initial states from the set `{setting.starts}` (seed {setting.seed}), {setting.duration:g} s "
+        f"each, RK4 with a step of {1000 * setting.dt:g} ms, the control held over a step, the voltage clipped at 12 "
+        "V. A run succeeds if from some moment, at least 1 s before its end, angle and cart stay within 0.05 rad and "
+        "0.05 m of upright and centre."
+    )
+    page.text(
+        "`hanging` initial states lie within 0.3 rad, 0.3 rad/s and 0.1 m of hanging at rest in the middle. The "
+        "`appendix` plant has the paper's printed parameters; the `identified` one those from which its printed gains "
+        "follow. Law `as-printed` has the paper's signs, `corrected` those that its derivation gives, with its gain k "
+        "= 0.2, `corrected-as-voltage` takes the wanted acceleration for a voltage, and `corrected-centred` has k = 5 "
+        "and holds the cart near the middle."
+    )
+
+
+def results(page: Page, rows: Sequence[Mapping[str, Any]], compared: list[Compared]) -> None:
+    """Adds the section with the reproduction's table.
+
+    Args:
+      rows: of the reproduction.
+      compared: results of `run_comparison`.
+    """
+    page.section("Results")
+    for sentence in (*reproduction_text.findings(rows), comparison_text.findings(compared)[-1]):
+        page.text(sentence)
+    page.table(reproduction_text.HEADER, [reproduction_text.cells(row) for row in rows], text_columns=4)
+    page.note(
+        "Settling, travel, effort and variation are over the successful runs, the peak voltage over all. "
+        "Every number is in `reproduction.json` beside this page."
+    )
+
+
+def paper_figures(page: Page, given: argparse.Namespace, setting: EvaluationConfig) -> None:
+    """Adds the section with the paper's figures, drawn from cpjax's runs."""
+    page.section("The paper's Figures 3 to 6, from our runs")
+    for name, figure, caption in reproduction_text.pictures(setting):
+        page.picture(save_figure(given.out / f"{name}.png", figure), caption)
 
 
 def designs(page: Page, given: argparse.Namespace) -> None:
@@ -274,3 +317,18 @@ def fronts(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
     for sentence in pareto.costs(found):
         page.note(sentence)
     page.note("Every point and its parameters are in `pareto.json`; `cpjax pareto` traces them with more effort.")
+
+
+def how_to_reproduce(page: Page, setting: EvaluationConfig, cells: int, studies: str) -> None:
+    """Adds the section with the command that makes this page."""
+    page.section("How to reproduce this page")
+    page.text(
+        f"`cpjax report --starts {setting.starts} --count {setting.count} --seed {setting.seed} "
+        f"--duration {_shortest(setting.duration)} --dt {_shortest(setting.dt)} --cells {cells} "
+        f"--studies {studies}` with cpjax {__version__}."
+    )
+
+
+def _shortest(seconds: float) -> str:
+    """Returns the number in six digits if they are exact, else in all of its digits."""
+    return f"{seconds:g}" if float(f"{seconds:g}") == seconds else repr(seconds)

@@ -66,7 +66,7 @@ def simulate(
         control = update_control(plant, controller, control, start, settings)
         mode = HeldMode(control.applied, plants.start_mode(plant, q, v))
     motion = start_motion(system, q, v, mode, dt)
-    loop = _Loop(motion, flag, motion.seen.output, _law(motion, control), control, jnp.zeros_like(flag))
+    loop = _Loop(motion, flag, motion.current.output, _law(motion, control), control, jnp.zeros_like(flag))
     first = _sample(plant, loop, motion, dt)
     started = start_metric(metric, first)
     if settings.derivative == "mean" and sees_the_voltage(metric, started, first):
@@ -107,7 +107,7 @@ def _run(
         kept = memory, loop.voltage, loop.mode
         memory, voltage, mode = jax.tree.map(lambda new, old: jnp.where(reached, new, old), updated, kept)
         loop = loop._replace(voltage=voltage, mode=mode)
-        return (loop, memory), (None if settings.save_every is None else (pack(sample), loop.motion.passed))
+        return (loop, memory), (None if settings.save_every is None else (pack(sample), loop.motion.grid_index))
 
     return scan(body, carry, jnp.arange(iterations, dtype=jnp.int32), settings.checkpoint)
 
@@ -122,18 +122,18 @@ def _sample(plant: Plant, loop: _Loop, before: Motion, dt: Step) -> Sample:
     """Returns the sample at the last point that was reached; `before` is the motion one iteration earlier."""
     motion = loop.motion
     held = isinstance(motion.mode, HeldMode)
-    landed = (before.stage == LANDED) & ~failures.is_stopped(loop.flag)
+    landed = (before.phase == LANDED) & ~failures.is_stopped(loop.flag)
     state = plants.state_of(plant, motion.q, motion.v)
     return Sample(
-        time=motion.passed.astype(dt.dtype) * dt + motion.offset,
+        time=motion.grid_index.astype(dt.dtype) * dt + motion.offset,
         elapsed=jnp.asarray(motion.elapsed),
         state=state,
-        voltage=motion.seen.output,
+        voltage=motion.current.output,
         voltage_since=loop.voltage,
-        voltage_until=None if held else jnp.where(landed, before.seen.output, motion.seen.output),
+        voltage_until=None if held else jnp.where(landed, before.current.output, motion.current.output),
         mode=_law(motion, loop.control),
         mode_before=loop.mode,
-        outputs=plants.outputs(plant, state, motion.seen.acceleration, motion.seen.output),
+        outputs=plants.outputs(plant, state, motion.current.acceleration, motion.current.output),
         plant_mode=motion.mode.plant,
         flag=loop.flag,
         crossing=jnp.where(landed, before.guard + (GATE_CROSSING if held else 0) + 1, 0),
@@ -150,27 +150,27 @@ def _advance(
     held = settings.clock == "sampled"
     system: System = HeldLoop(plant) if held else ContinuousLoop(plant, controller)
     motion = loop.motion
-    stopped, ended = failures.is_stopped(loop.flag), motion.passed >= settings.steps
-    outlook = failures.look_ahead(plant, motion.v, motion.seen.acceleration, dt)
+    stopped, ended = failures.is_stopped(loop.flag), motion.grid_index >= settings.steps
+    outlook = failures.look_ahead(plant, motion.v, motion.current.acceleration, dt)
     going = ~stopped & ~ended & outlook.possible
     after, reached = iterate(system, integrator, failures.safe(going, motion), dt)
     within, lost = failures.verdict(plant, plants.state_of(plant, after.q, after.v), outlook)
-    good = going & within & (left > settings.steps - after.passed)
+    good = going & within & (left > settings.steps - after.grid_index)
     reason = jnp.where(going & within, np.int32(Flag.OVERFLOW), lost)
     chatter = jnp.where(good & (after.crossings >= CHATTER_LENGTH), np.int32(Flag.CHATTERING), np.int32(0))
     flag = loop.flag | jnp.where(stopped | ended | good, np.int32(0), reason) | chatter
     # A held run passes one grid point per iteration.
     on_hold = motion._replace(
-        passed=motion.passed + (~ended).astype(motion.passed.dtype),
+        grid_index=motion.grid_index + (~ended).astype(motion.grid_index.dtype),
         offset=jnp.zeros_like(motion.offset),
         elapsed=jnp.where(ended, motion.elapsed, 0.0),
-        stage=jnp.full_like(motion.stage, RUN),
+        phase=jnp.full_like(motion.phase, RUN),
     )
-    before = motion.passed
+    before = motion.grid_index
     motion = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, on_hold)
     loop = loop._replace(motion=motion, flag=flag)
     if held:
-        instant = (motion.passed != before) & (motion.passed % settings.steps_per_control == 0)
+        instant = (motion.grid_index != before) & (motion.grid_index % settings.steps_per_control == 0)
         loop = _control(plant, controller, system, loop, instant, settings)
     return loop, (good & reached) | (~good & ~ended)
 
@@ -185,8 +185,8 @@ def _control(
     control = update_control(plant, controller, loop.control, state, settings)
     changes = jnp.where(control.mode != loop.control.mode, loop.changes + 1, 0)
     mode = motion.mode._replace(u=control.applied)
-    seen, slopes, _ = observe(system, motion.q, motion.v, mode)
-    new = (control, changes, motion._replace(mode=mode, seen=seen, slopes=slopes))
+    current, slopes, _ = observe(system, motion.q, motion.v, mode)
+    new = (control, changes, motion._replace(mode=mode, current=current, slopes=slopes))
     control, changes, motion = jax.tree.map(
         lambda x, y: jnp.where(instant, x, y), new, (loop.control, loop.changes, motion)
     )

@@ -7,9 +7,9 @@ method's order, and the instant of the change moves with the parameters as in th
 derivatives.
 
 This is a small state machine with one integrator step per iteration, so that under `vmap` each batch element advances
-in its own time and a crossing in one costs the others nothing. `Motion.stage` determines what an iteration does:
+in its own time and a crossing in one costs the others nothing. `Motion.phase` determines what an iteration does:
 
-    RUN     a step to the next grid point; accepted, or, if a guard fell, a crossing is located: stage 1
+    RUN     a step to the next grid point; accepted, or, if a guard fell, a crossing is located: phase 1
     1, ...  the step up to the estimated crossing, corrected by Newton's method; after the last correction: LANDED
     LANDED  a step of zero length, which evaluates everything in the new mode; then RUN, for the rest of the step
 
@@ -40,7 +40,7 @@ Tree: TypeAlias = Any
 Guards: TypeAlias = tuple[Scalar, ...]
 """Values of the guards, by number."""
 
-RUN, LANDED = 0, -1
+RUN, LOCATE, LANDED = 0, 1, -1
 _CORRECTIONS = 2
 
 CROSSING_COST = _CORRECTIONS + 2
@@ -77,11 +77,11 @@ class Motion(NamedTuple):
     q: Tree
     v: Tree
     mode: Tree
-    seen: Observation
+    current: Observation
     """Observation at (q, v) in `mode`; just after a crossing, at the end of the previous mode."""
     slopes: Guards
     """d guards / dt, not differentiable."""
-    passed: Int[Array, ""]
+    grid_index: Int[Array, ""]
     """Number of grid points passed, int32."""
     offset: Step
     """Time since the last grid point [s]."""
@@ -89,11 +89,11 @@ class Motion(NamedTuple):
     """Step that the next iteration tries [s]."""
     elapsed: Step
     """Time between the last two points that were reached [s]."""
-    stage: Int[Array, ""]
+    phase: Int[Array, ""]
     """Names what the next iteration does: `RUN`, `LANDED`, or the number of the correction, int32."""
     guard: Int[Array, ""]
     """Number of the guard whose crossing is being located, int32."""
-    reach: Step
+    bracket: Step
     """Length of a step after which that guard has fallen [s]."""
     crossings: Int[Array, ""]
     """Number of crossings since the last grid point, int32."""
@@ -101,9 +101,9 @@ class Motion(NamedTuple):
 
 def start_motion(system: System, q: Tree, v: Tree, mode: Tree, dt: Step) -> Motion:
     """Returns the motion at the first grid point, with steps of `dt` [s]."""
-    seen, slopes, _ = observe(system, q, v, mode)
+    current, slopes, _ = observe(system, q, v, mode)
     none = jnp.zeros_like(dt, dtype=jnp.int32)
-    return Motion(q, v, mode, seen, slopes, none, 0.0 * dt, dt, 0.0 * dt, none + RUN, none, dt, none)
+    return Motion(q, v, mode, current, slopes, none, 0.0 * dt, dt, 0.0 * dt, none + RUN, none, dt, none)
 
 
 def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) -> tuple[Motion, Bool[Array, ""]]:
@@ -111,27 +111,27 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) ->
 
     Points are reached on the grid and at each crossing, there in the new mode.
     """
-    seen, step, stage = motion.seen, motion.step, motion.stage
+    current, step, phase = motion.current, motion.step, motion.phase
     q, v = integrator(
-        lambda q, v: system.observe(q, v, motion.mode).acceleration, motion.q, motion.v, step, seen.acceleration
+        lambda q, v: system.observe(q, v, motion.mode).acceleration, motion.q, motion.v, step, current.acceleration
     )
-    ahead, slopes, drift = observe(system, q, v, motion.mode)
-    landed, locating = stage == LANDED, stage >= 1
+    trial, slopes, drift = observe(system, q, v, motion.mode)
+    landed, locating = phase == LANDED, phase >= LOCATE
 
     # Newton's correction, unless it is too large to be valid: then the cubic approximated the guard badly.
-    value = pick(ahead.guards, motion.guard)
-    steepness = (jnp.abs(pick(seen.guards, motion.guard)) + jnp.abs(value)) / dt
+    value = pick(trial.guards, motion.guard)
+    steepness = (jnp.abs(pick(current.guards, motion.guard)) + jnp.abs(value)) / dt
     correction = newton_correction(value, pick(slopes, motion.guard), steepness)
     room = dt * float(np.finfo(dt.dtype).eps) ** 0.5
-    far = (jnp.abs(correction) > 0.05 * motion.reach + room) | (step + correction < -room)
-    missed = locating & far & (motion.reach > room)
+    far = (jnp.abs(correction) > 0.05 * motion.bracket + room) | (step + correction < -room)
+    missed = locating & far & (motion.bracket > room)
     correction = jnp.where(far, 0.0, correction)
     corrected = step + correction
 
     # The first guard to fall, if any. The one whose crossing is being located is about zero, of either sign; another
     # one that falls at the same time is located afterwards.
     soonest, first = jnp.full_like(step, jnp.inf), jnp.zeros_like(motion.guard)
-    for number, (before, after) in enumerate(zip(seen.guards, ahead.guards, strict=True)):
+    for number, (before, after) in enumerate(zip(current.guards, trial.guards, strict=True)):
         sought = locating & (motion.guard == number)
         fallen = (after < 0.0) & (step > 0.0) & ~landed & (~sought | missed)
         above = jnp.maximum(before, 0.0)
@@ -141,46 +141,46 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) ->
         soonest = jnp.minimum(secant, soonest)
     fell = soonest < jnp.inf
     fraction = crossing_fraction(
-        pick(seen.guards, first),
+        pick(current.guards, first),
         step * pick(motion.slopes, first),
-        pick(ahead.guards, first),
+        pick(trial.guards, first),
         step * pick(slopes, first),
     )
     fraction = jnp.where(missed, 0.5, fraction)
 
     short = missed & ~fell  # short of the crossing: continue from this point
-    refine = locating & ~fell & ~short & (stage < _CORRECTIONS)
-    land = locating & ~fell & ~short & (stage >= _CORRECTIONS)
+    refine = locating & ~fell & ~short & (phase < _CORRECTIONS)
+    land = locating & ~fell & ~short & (phase >= _CORRECTIONS)
     reached = short | ~(fell | locating)
     at_grid = reached & ~landed & ~short
 
     new_q, new_v, new_mode = system.jump(
         jax.tree.map(lambda q, v: q + correction * v, q, v),
-        jax.tree.map(lambda v, a: v + correction * a, v, ahead.acceleration),
+        jax.tree.map(lambda v, a: v + correction * a, v, trial.acceleration),
         motion.mode,
         motion.guard,
     )
     q, v = _where(land, (new_q, new_v), (q, v))
     # The last correction is zero to rounding, and carries the second derivative of the crossing's time.
-    ahead = ahead._replace(output=_shifted(ahead.output, drift, jnp.where(land, correction, 0.0)))
+    trial = trial._replace(output=_shifted(trial.output, drift, jnp.where(land, correction, 0.0)))
     moved = land | reached
     offset = jnp.where(land | short, motion.offset + corrected, jnp.where(at_grid, 0.0, motion.offset))
     step_next = jnp.where(fell, lax.stop_gradient(fraction * step), jnp.where(refine, corrected, dt - offset))
-    stage_next = jnp.where(fell, 1, jnp.where(refine, stage + 1, jnp.where(land, LANDED, RUN)))
+    phase_next = jnp.where(fell, LOCATE, jnp.where(refine, phase + 1, jnp.where(land, LANDED, RUN)))
     return (
         Motion(
             q=_where(moved, q, motion.q),
             v=_where(moved, v, motion.v),
             mode=_where(land, new_mode, motion.mode),
-            seen=_where(moved, ahead, seen),
+            current=_where(moved, trial, current),
             slopes=_where(moved, slopes, motion.slopes),
-            passed=motion.passed + at_grid.astype(motion.passed.dtype),
+            grid_index=motion.grid_index + at_grid.astype(motion.grid_index.dtype),
             offset=offset,
             step=jnp.where(land, 0.0, step_next),
             elapsed=jnp.where(land | short, corrected, jnp.where(at_grid, step, motion.elapsed)),
-            stage=stage_next.astype(stage.dtype),
+            phase=phase_next.astype(phase.dtype),
             guard=jnp.where(fell, first, motion.guard),
-            reach=jnp.where(fell, lax.stop_gradient(step), motion.reach),
+            bracket=jnp.where(fell, lax.stop_gradient(step), motion.bracket),
             crossings=jnp.where(at_grid, 0, motion.crossings + land.astype(motion.crossings.dtype)),
         ),
         reached,
@@ -190,15 +190,15 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) ->
 def observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, Guards, list[Float[Array, "..."]]]:
     """Returns the system's observation, and the rates of change of its guards and of the floating-point leaves of its
     output, which are not differentiable."""
-    seen = system.observe(q, v, mode)
-    rates = lax.stop_gradient((v, seen.acceleration))
+    current = system.observe(q, v, mode)
+    rates = lax.stop_gradient((v, current.acceleration))
 
     def changing(q: Tree, v: Tree) -> tuple[Guards, list[Float[Array, "..."]]]:
         now = system.observe(q, v, mode)
         return now.guards, [leaf for leaf in jax.tree.leaves(now.output) if _is_float(leaf)]
 
     _, (slopes, drift) = jax.jvp(changing, lax.stop_gradient((q, v)), rates)
-    return seen, lax.stop_gradient(slopes), lax.stop_gradient(drift)
+    return current, lax.stop_gradient(slopes), lax.stop_gradient(drift)
 
 
 def _is_float(leaf: Any) -> bool:
