@@ -87,7 +87,7 @@ def write_report(
     sections_of.results(page, rows, results)
     sections_of.paper_figures(page, given, setting)
     sections_of.designs(page, given)
-    sections_of.forensics(page, given)
+    sections_of.gain_identification(page, given)
     if studies != "none":
         sections_of.gradients(page, given, studies)
         sections_of.tuning(page, given, parts, studies)

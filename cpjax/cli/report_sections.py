@@ -112,7 +112,7 @@ def designs(page: Page, given: argparse.Namespace) -> None:
     page.note("Every number is in `designs.json`; `cpjax design` checks any other regulator.")
 
 
-def forensics(page: Page, given: argparse.Namespace) -> None:
+def gain_identification(page: Page, given: argparse.Namespace) -> None:
     """Adds the section on plants that explain the printed gains, and writes audit_gains.json and audit_gains.png."""
     plant, prints = paper.appendix_plant(), printed_in_the_paper()
     with progress("audit-gains") as report:

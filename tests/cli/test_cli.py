@@ -868,7 +868,7 @@ def test_the_comparison_in_a_report_is_that_of_its_json(report):
 
 @pytest.mark.slow
 def test_the_studies_in_a_report_are_those_of_its_json(command, tmp_path, monkeypatch):
-    monkeypatch.setattr(report_sections, "forensics", lambda page, given: None)
+    monkeypatch.setattr(report_sections, "gain_identification", lambda page, given: None)
     fronts = {"bounds": 2, "candidates": 64, "steps": 2, "reevaluation": 16, "final": 16}
     monkeypatch.setattr(report_sections, "QUICK_FRONTS", fronts)
     tuning = {"candidates": 15, "restarts": 2, "batch": 2, "steps": 2, "final": 64}
@@ -904,7 +904,7 @@ def test_a_report_names_its_setting_and_the_command_that_makes_it_again(report):
 @pytest.mark.slow
 def test_a_report_of_odd_numbers_gives_the_command_with_all_their_digits(command, tmp_path, no_pictures, monkeypatch):
     monkeypatch.setattr(reproduction, "evaluate", fake_evaluate)
-    for section in ("designs", "forensics"):
+    for section in ("designs", "gain_identification"):
         monkeypatch.setattr(report_sections, section, lambda page, given: None)
     few = ("--count", "3", "--cells", "0", "--studies", "none")
     command("report", "--out", tmp_path, *few, "--duration", "1.23456789", "--dt", "0.00123456789")
