@@ -75,6 +75,9 @@ def plant_system(plant: CartPole) -> control.NonlinearIOSystem:
 
     The motor clips the voltage, as everywhere in cpjax; python-control reports the demanded one.
 
+    Args:
+      plant: a plant with concrete numbers.
+
     Raises:
       InputError: `plant` is not a CartPole with concrete numbers.
     """
@@ -134,6 +137,9 @@ def gain_array(law: StateFeedback) -> Float[np.ndarray, "1 4"]:
     """Returns K of u = -K s as python-control writes it [V per unit of state].
 
     The law takes the angle modulo a turn, which a gain cannot: the two agree within half a turn of upright.
+
+    Args:
+      law: a law with concrete numbers whose reference is the origin.
 
     Raises:
       InputError: `law` is not a StateFeedback with concrete numbers, or its reference is not the origin:

@@ -65,7 +65,13 @@ def variants() -> list[Variant]:
 
 
 def evaluate(variant: Variant, setting: EvaluationConfig, starts: State | None = None) -> Metrics:
-    """Returns the metrics (n,) of one variant from the initial states `starts` (n,), by default the setting's."""
+    """Returns the metrics of one variant, arrays (n,).
+
+    Args:
+      variant: the controller and the plant.
+      setting: configuration of the evaluation.
+      starts: initial states, arrays (n,); by default the setting's.
+    """
     plant = paper.PLANTS[variant.plant]()
     controller = paper.controller(variant.law, variant.design, plant, variant.gains)
     if starts is None:

@@ -52,6 +52,8 @@ class Plant(Protocol):
 
         Args:
           geometry: what `geometry(q)` returns, for a plant that has it (see `Geometric`); else q.
+          v: velocities.
+          u: the input that the drive applies.
         """
         ...
 
@@ -122,7 +124,11 @@ def check_plant(plant: Any) -> None:
 
 
 def coordinates(plant: Plant, state: PlantState) -> tuple[Tree, Tree]:
-    """Returns (q, v) of a state."""
+    """Returns (q, v) of a state.
+
+    Raises:
+      InputError: the plant's `coordinates` returns no pair, or positions and velocities of two structures.
+    """
     q, v = pair("plant.coordinates", call("plant", plant, "coordinates", state), "positions and velocities")
     here, there = str(jax.tree.structure(q)), str(jax.tree.structure(v))
     if here != there:
@@ -149,7 +155,11 @@ def geometry(plant: Plant, q: Tree) -> Tree:
 
 
 def geometry_near(plant: Plant, at: Tree, q: Tree, change: Tree) -> tuple[Tree, Bool[Array, ""]]:
-    """Returns the geometry at q, given the geometry `at` the positions q - `change`, and whether it is accurate."""
+    """Returns the geometry at q, given the geometry `at` the positions q - `change`, and whether it is accurate.
+
+    Raises:
+      InputError: the plant's `geometry_near` returns no pair of a geometry like the given one and a bool.
+    """
     if not isinstance(plant, Geometric):
         return q, jnp.asarray(True)
     returned = call("plant", plant, "geometry_near", at, change)

@@ -37,6 +37,11 @@ def step_held(
     """Returns the state after `dt` [s] under a constant input `u` (zero-order hold).
 
     Args:
+      plant: the plant.
+      integrator: the method of one step.
+      state: state at the beginning of the step.
+      u: the input that the drive applies.
+      dt: length of the step [s].
       first: the accelerations at `state`, if already known.
     """
 
@@ -59,7 +64,13 @@ def step_held_incremental(
     """Computes `step_held` with the geometry at the later stages derived from that at `state`.
 
     Args:
+      plant: the plant.
+      integrator: the method of one step.
+      state: state at the beginning of the step.
       geometry: of the plant at `state`.
+      u: the input that the drive applies.
+      dt: length of the step [s].
+      first: the accelerations at `state`, if already known.
 
     Returns:
       The state after `dt` [s], and whether all its geometries were accurate to rounding.
@@ -90,6 +101,12 @@ def step_continuous(
     """Returns the state after `dt` [s] with the law of `mode` evaluated, and its voltage clipped, in every stage.
 
     Args:
+      plant: the plant.
+      controller: laws by mode.
+      integrator: the method of one step.
+      state: state at the beginning of the step.
+      mode: the controller's mode during the step.
+      dt: length of the step [s].
       first: the accelerations at `state`, if already known.
     """
 

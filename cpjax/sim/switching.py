@@ -90,7 +90,7 @@ class Motion(NamedTuple):
     elapsed: Step
     """Time between the last two points that were reached [s]."""
     phase: Int[Array, ""]
-    """Names what the next iteration does: `RUN`, `LANDED`, or the number of the correction, int32."""
+    """Task of the next iteration: `RUN`, `LANDED`, or the number of the correction, int32."""
     guard: Int[Array, ""]
     """Number of the guard whose crossing is being located, int32."""
     bracket: Step

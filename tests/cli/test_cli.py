@@ -897,7 +897,7 @@ def test_the_studies_in_a_report_are_those_of_its_json(command, tmp_path, monkey
 
 def test_a_report_names_its_setting_and_the_command_that_makes_it_again(report):
     text = "".join(report.page.words)
-    assert "8 starts from the set hanging (seed 1), 12 s each, RK4 with a step of 10 ms" in text
+    assert "8 initial states from the set hanging (seed 1), 12 s each, RK4 with a step of 10 ms" in text
     assert "cpjax report --starts hanging --count 8 --seed 1 --duration 12 --dt 0.01 --cells 0 --studies none" in text
 
 
