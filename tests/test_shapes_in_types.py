@@ -5,6 +5,7 @@ is called, traced by `jit` and `vmap` where JAX can.
 """
 
 import contextlib
+import functools
 import importlib
 import inspect
 import os
@@ -296,7 +297,7 @@ def check_package(package):
 
 
 def check_runs():
-    """Runs a rollout and a sweep, and traces a batch of gradients."""
+    """Runs a sweep, and traces a batch of rollouts and of gradients."""
     import jax
     import jax.numpy as jnp
 
@@ -308,13 +309,14 @@ def check_runs():
         regulator = cpjax.StateFeedback(jnp.asarray([[-3.0, -6.0, 70.0, 18.0]]))
         return cpjax.Hybrid(cpjax.EnergySwingUp(plant, gain), regulator, cpjax.AngleGate(0.3, 0.1))
 
-    def last(gain, start):
-        return cpjax.rollout(plant, controller(gain), start, switching="located", **times).state.theta[-1]
+    def last(gain, start, switching):
+        return cpjax.rollout(plant, controller(gain), start, switching=switching, **times).state.theta[-1]
 
     starts = cpjax.sample_starts("anywhere", 3, seed=1)
-    cpjax.rollout(plant, controller(2.0), cpjax.HANGING, **times)
     cpjax.sweep(plant, controller(2.0), starts, **times)
-    jax.eval_shape(jax.vmap(jax.grad(last), in_axes=(None, 0)), 2.0, jax.tree.map(jnp.asarray, starts))
+    for function, switching in ((last, "per_step"), (jax.grad(last), "located")):
+        one = functools.partial(function, 2.0, switching=switching)
+        jax.eval_shape(jax.jit(jax.vmap(one)), jax.tree.map(jnp.asarray, starts))
 
 
 def check_refusals():
