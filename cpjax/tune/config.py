@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import jax
+from jaxtyping import Array, Float
 
 from cpjax.errors import InputError
 from cpjax.fields import choice, config, count, number
@@ -124,8 +124,8 @@ class TuningConfig:
         if self.restarts > self.candidates + 1:
             raise InputError("restarts", self.restarts, f"at most candidates + 1, {self.candidates + 1}")
 
-    def aggregated(self, values: jax.Array) -> jax.Array:
-        """Returns one number () for the objective's values of a batch (n,)."""
+    def aggregated(self, values: Float[Array, " starts"]) -> Float[Array, ""]:
+        """Returns one number for the objective's values of a batch."""
         return _AGGREGATES[self.aggregate](self)(values)
 
     @property
