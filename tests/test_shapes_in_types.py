@@ -28,6 +28,8 @@ def public_things():
             for name, thing in vars(module).items():
                 if name.startswith("_") or getattr(thing, "__module__", None) != module.__name__:
                     continue
+                if getattr(thing, "__name__", name) != name:  # an old name of another thing
+                    continue
                 if not inspect.isclass(thing):
                     yield from [f"{package}.{info.name}.{name}"] if callable(thing) else []
                 elif not getattr(thing, "_is_protocol", False):
@@ -102,7 +104,7 @@ def calls():
         "linear.margins.closed_loop_poles": call(A, B, K),
         "linear.margins.characteristic_polynomial": call(A),
         "linear.margins.loop_polynomials": call(A, b, k),
-        "linear.margins.margins": call(A, b[:, None], k[0]),
+        "linear.margins.stability_margins": call(A, b[:, None], k[0]),
         "linear.placement.place": call(A, b, poles),
         "linear.placement.place_polynomial": call(A, b, b),
         "linear.placement.polynomial_from_poles": call(poles),
