@@ -78,6 +78,7 @@ def test_a_controller_of_ones_own_runs_alone_under_jit_under_vmap_and_in_a_sweep
     assert_close(jax.tree.map(lambda x: x[1], saved.state), jax.tree.map(lambda x: x[::50], alone.state), 1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MARKED)
 def test_its_derivative_is_that_of_differences_forward_in_reverse_and_under_vmap(name):
     make, field = EXAMPLES[name]
@@ -413,6 +414,7 @@ class Dithering:
         return key, voltage + 0.1 * jax.random.normal(now, dtype=voltage.dtype)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [jax.random.key, jax.random.PRNGKey])
 def test_a_random_key_may_be_part_of_a_controller_and_of_its_memory(make):
     law = paper.regulator("lqr", "printed", PLANT)

@@ -164,6 +164,7 @@ UNUSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", UNUSED.values(), ids=UNUSED)
 def test_numbers_that_the_compiler_finds_unused_do_no_harm(function):
     kind = law(function)
@@ -237,6 +238,7 @@ CALLS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", CALLS.values(), ids=CALLS)
 def test_a_law_that_calls_another_library_works_as_ever(function):
     controller = law(function)()

@@ -224,6 +224,7 @@ def test_without_a_clip_the_continuous_loop_is_the_rollout_before_and_after_a_ca
     np.testing.assert_array_equal(outputs["mode"], run.mode)
 
 
+@pytest.mark.slow
 @rows("plant", [paper.appendix_plant(), ROUGH], ids=["appendix", "rough"])
 @rows(("start", "mode"), [(LEANING, 0), (State(0.2, -0.3, 0.45, -0.2), 1)], ids=["swinging up", "catching"])
 def test_with_the_clip_the_continuous_loop_is_the_rollout_in_either_mode(plant, start, mode):
@@ -255,6 +256,7 @@ def test_a_law_on_its_own_closes_the_loop_in_mode_0():
 # The closed loop in discrete time
 
 
+@pytest.mark.slow
 @rows(
     ("controller", "start", "switches"),
     [

@@ -276,7 +276,7 @@ class StoppedError(InputError):
 
 @pytest.mark.parametrize(
     ("module", "work", "name"),
-    [(basin, "drawn", "basin"), (animate, "animated", "animate"), (compare, "compared", "compare")],
+    [(basin, "run_basin", "basin"), (animate, "run_animation", "animate"), (compare, "run_comparison", "compare")],
 )
 def test_commands_of_several_controllers_say_which_were_made_for_another_plant(
     command, tmp_path, monkeypatch, module, work, name

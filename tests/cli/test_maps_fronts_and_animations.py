@@ -21,6 +21,7 @@ def stop(*_, **__):
     raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_basin_writes_maps_with_the_shares_of_their_runs_after_an_interruption_too(command, tmp_path, monkeypatch):
     odd = str(tmp_path / r"a $\frac$ [bold] <b>.json")  # a formula, a style or a tag, if anything takes it for one
     cpjax.save(odd, cpjax.preset("placement"))
@@ -72,6 +73,7 @@ def run():
     return cpjax.rollout(plant, cpjax.preset("lqr"), cpjax.HANGING, duration=0.5, dt=0.002, clock="sampled")
 
 
+@pytest.mark.slow
 def test_an_animation_as_a_page_holds_its_pictures_and_asks_for_nothing(command, tmp_path):
     assert command("animate", "--format", "html", "--duration", 0.5, "--out", tmp_path).code == 0
     page = (tmp_path / "animation.html").read_text()
@@ -112,6 +114,7 @@ def test_a_page_that_would_lack_pictures_is_refused(command, tmp_path, monkeypat
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_gif_keeps_time_and_has_the_colours_of_what_comes_later(command, tmp_path):
     # As printed, and from rest, the law asks for nothing at first: no green bar in the first picture.
     arguments = ("--controllers", "as-printed/lqr", "tuned_lqr", "--theta", 2.8, "--duration", 1, "--rate", 30)
@@ -191,6 +194,7 @@ def test_a_trail_has_the_last_six_tenths_of_a_second(run):
     assert stage._trail.get_xdata().shape == (60,)
 
 
+@pytest.mark.slow
 def test_without_an_encoder_a_film_becomes_a_page(command, tmp_path, monkeypatch):
     monkeypatch.setattr(animation, "encoder", lambda: None)
     done = command("animate", "--format", "mp4", "--duration", 0.1, "--out", tmp_path)

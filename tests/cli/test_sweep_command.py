@@ -16,6 +16,7 @@ def run(out, *arguments):
     return main(["sweep", *SHORT, "--out", str(out), *arguments])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_it_writes_the_metrics_of_every_start_a_summary_and_a_picture(precision, tmp_path, capsys):
     assert run(tmp_path, "--precision", precision) == 0

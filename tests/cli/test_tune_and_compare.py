@@ -164,7 +164,7 @@ def test_the_start_that_is_shown_is_the_first_that_all_catch_and_says_so():
     assert words.startswith("number 3 of 3")
     start, words = representative_start(starts, [one(True, False, False), one(False, True, True)])
     assert start.theta == float(starts.theta[0])
-    assert "no start is caught by all" in words
+    assert "no initial state is caught by all" in words
 
 
 def test_the_phase_portrait_shows_the_run_and_the_gate_where_the_controller_has_it():

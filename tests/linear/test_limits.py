@@ -318,6 +318,7 @@ def test_second_derivatives_of_the_level_inside_are_those_of_the_first():
         np.testing.assert_allclose(hessian(limits), expected, rtol=1e-8, atol=1e-8 * np.max(np.abs(expected)))
 
 
+@pytest.mark.slow
 @rows("half_angle", [1e-6, 0.5, 3.1, math.pi])
 @rows("rate", [1e-6, 2.0, 1e4])
 def test_no_derivative_of_the_level_inside_angle_and_rate_is_nan(half_angle, rate):

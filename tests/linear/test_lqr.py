@@ -159,6 +159,7 @@ def test_one_state_has_the_gain_of_a_quadratic_equation(a, b, q, r):
     assert float(dlqr(*problem).K[0, 0]) == pytest.approx(a * b * p / (r + b * b * p), rel=1e-14)
 
 
+@pytest.mark.slow
 @continuous_discrete_slow
 def test_float32_arguments_give_the_papers_gain_to_a_few_of_their_digits(time):
     narrow = [matrix.astype(np.float32) for matrix in PAPER[time]]
@@ -211,6 +212,7 @@ def test_whatever_batch_a_problem_is_solved_in_it_has_the_same_gain(time):
         np.testing.assert_allclose(P, alone.P, rtol=1e-14)
 
 
+@pytest.mark.slow
 @both
 def test_what_a_gain_cannot_be_computed_for_is_refused_and_nan_inside_jit(time):
     A, B, Q, R = PAPER[time]

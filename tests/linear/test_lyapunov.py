@@ -37,6 +37,7 @@ def exact_solution(time, A, Q):
         return np.array(X.tolist(), dtype=np.float64).reshape(A.shape)
 
 
+@pytest.mark.slow
 @both
 @rows("n", [1, 2, 4])
 def test_the_solution_is_the_exact_one_rounded_even_near_the_edge_of_stability(time, n):

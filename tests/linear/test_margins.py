@@ -355,6 +355,7 @@ def test_without_feedback_nothing_limits_a_stable_plant(B, K):
         assert math.isnan(getattr(found, f"{name}_frequency"))
 
 
+@pytest.mark.slow
 def test_of_an_unstable_loop_all_margins_are_nan_with_finite_derivatives():
     A, B, K = papers_loop("appendix", "placement")
     found = stability_margins(A, B, -K)
@@ -453,6 +454,7 @@ def test_every_finite_margins_derivative_agrees_with_differences(loop):
         assert np.all(np.abs(ahead - differences) <= 1e-8 * scale)
 
 
+@pytest.mark.slow
 @rows(
     "loop",
     [

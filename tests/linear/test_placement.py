@@ -136,6 +136,7 @@ def test_float32_arguments_give_a_float32_gain_to_its_rounding(poles):
     assert place(narrow[0], B, poles).dtype == jnp.float64
 
 
+@pytest.mark.slow
 def test_one_state_and_chains_of_integrators_have_the_gains_of_the_textbook():
     np.testing.assert_array_equal(place([[2.0]], [3.0], [-1.0]), [[1.0]])
     np.testing.assert_array_equal(place(np.eye(5, k=1), np.eye(5)[:, 4], [-1.0] * 5), [[1.0, 5.0, 10.0, 10.0, 5.0]])
@@ -289,6 +290,7 @@ def functions(gain):
     return jax.jit(jax.vmap(gain)), jacobians
 
 
+@pytest.mark.slow
 def test_all_derivatives_agree_with_differences_at_multiple_poles_too():
     n, x = 3, points(3)
     batched, jacobians = functions(lambda x: gain(x, 3))

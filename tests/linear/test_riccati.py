@@ -68,6 +68,7 @@ def exact(x):
 # --- what has a solution ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @both
 def test_without_state_weights_a_stable_plant_is_left_alone_exactly(time):
     rng = np.random.default_rng(1)
@@ -92,6 +93,7 @@ def test_a_stable_mode_that_no_weight_sees_costs_nothing(time):
     assert slowest(time, A, B, K) > 0
 
 
+@pytest.mark.slow
 @both
 def test_a_stable_mode_that_no_input_moves_is_weighed_as_it_decays(time):
     mode = -0.5 if time == "continuous" else 0.5
@@ -179,6 +181,7 @@ def test_a_problem_without_a_solution_is_refused_with_the_reason(time, name):
     assert caught.value.field == field
 
 
+@pytest.mark.slow
 @both
 def test_inside_jit_an_unsolvable_problem_is_nan_and_affects_no_other_element(time):
     good = (np.array([[0.0, 1.0], [1.3, -0.2]]), np.array([[0.0], [1.0]]), np.diag([1.0, 2.0]), 0.5 * ONE)

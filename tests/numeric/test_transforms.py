@@ -77,6 +77,7 @@ def flat(Q):
     return from_semidefinite(Q.reshape(3, 3))
 
 
+@pytest.mark.slow
 def test_the_derivatives_agree_forward_in_reverse_and_with_differences():
     rng = np.random.default_rng(6)
     x = rng.normal(size=(4, 6))

@@ -198,7 +198,7 @@ def test_progress_counts_the_sets_up_to_their_number():
     audit_gains(printed_in_the_paper(), APPENDIX, parameters=PAIR, **SMALL, progress=lambda *call: calls.append(call))
     assert [call[:2] for call in calls] == [(0, 3), (3, 3)]
     assert "2" in calls[0][2]
-    assert "8 starts" in calls[0][2]
+    assert "8 initial states" in calls[0][2]
 
 
 # --- made-up rigs, whose truth is known -------------------------------------------------------------------------------
@@ -359,7 +359,7 @@ def test_a_set_from_which_no_start_leads_anywhere_explains_nothing(monkeypatch):
 
 
 def test_more_fits_than_run_side_by_side_are_those_of_one_go(monkeypatch):
-    monkeypatch.setattr(plant_fit, "_LANES", 7)
+    monkeypatch.setattr(plant_fit, "_BATCH", 7)
     sizes = fake_ends(monkeypatch, lambda lane: [float(lane + 1)] * 8)
     calls = []
     audit = audit_gains(

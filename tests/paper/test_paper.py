@@ -77,6 +77,7 @@ def test_the_second_printed_form_of_the_lagrangian_equals_the_first():
         assert second == pytest.approx(float(printed_lagrangian(jnp.asarray(q), jnp.asarray(v))), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_the_printed_x_equation_has_two_signs_of_the_opposite_theta():
     for q, v, a in POINTS:
         th, th_dot = q[1], v[1]

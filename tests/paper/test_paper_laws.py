@@ -108,6 +108,7 @@ def test_with_only_one_of_its_signs_corrected_the_law_brakes_and_never_gets_ther
     np.testing.assert_allclose(end, HANGING_ENERGY, rtol=0, atol=1e-5)  # it comes to rest where it hangs
 
 
+@pytest.mark.slow
 @both_plants
 @both_clocks
 def test_the_corrected_law_read_as_a_voltage_never_gets_there(plant, clock):

@@ -52,6 +52,7 @@ def test_the_error_on_a_damped_oscillation_shrinks_with_the_methods_order(name):
     assert fitted_order(duration / counts, errors) == pytest.approx(ORDERS[name], abs=0.1)
 
 
+@pytest.mark.slow
 @METHODS
 def test_the_error_of_a_rollout_shrinks_with_its_integrators_order(name):
     # Smooth: the motor's terminals are shorted, so nothing clips or switches.

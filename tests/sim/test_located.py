@@ -130,6 +130,7 @@ def test_in_a_sweep_each_start_crosses_at_its_own_time_as_if_alone():
 # --- limits -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_with_too_few_spare_steps_is_stopped_flagged_and_no_success():
     runs = {n: located(PLANT, SOFT, NEAR, duration=8.0, spare_steps=n) for n in (8, 400)}
     assert runs[400].flag == 0

@@ -112,6 +112,7 @@ def differences(i, wrap, metrics, count=40_000, move=4e-3):
     return each.mean(), each.std() / math.sqrt(count)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("delayed", "metrics"),
     [
@@ -159,6 +160,7 @@ def test_values_are_those_of_the_plain_loop_and_float32_works():
     assert np.all(np.isfinite(slopes))
 
 
+@pytest.mark.slow
 def test_a_second_derivative_of_the_mean_is_refused():
     def outside(gain):
         p = jnp.stack([gain, P[1], P[2]])

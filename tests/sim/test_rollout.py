@@ -176,6 +176,7 @@ def test_sweep_reports_progress_block_by_block():
     assert seen == [(2, 5), (4, 5), (5, 5)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clock", ["sampled", "continuous"])
 def test_a_float32_start_makes_a_float32_rollout_close_to_the_float64_one(clock):
     start = jax.tree.map(jnp.float32, START)

@@ -36,6 +36,7 @@ def assert_same(a, b, **tolerance):
         np.testing.assert_allclose(x, y, **tolerance) if tolerance else np.testing.assert_array_equal(x, y)
 
 
+@pytest.mark.slow
 def test_4096_starts_of_10_s_run_under_one_vmap_within_a_gibibyte(monkeypatch):
     monkeypatch.syspath_prepend(str(EXPERIMENTS))
     start_up = importlib.import_module("start_up")  # its script runs in a process of its own
@@ -126,7 +127,7 @@ def test_each_start_may_have_its_own_plant_and_controller():
 @pytest.mark.parametrize("count", [1, 3, 5])
 def test_a_batch_of_plants_of_another_length_is_refused(count):
     starts = cpjax.sample_starts("anywhere", 4, seed=7)
-    with pytest.raises(InputError, match=r"plant.cart_mass .* of shape \(\); or \(4,\), one for each start"):
+    with pytest.raises(InputError, match=r"plant.cart_mass .* of shape \(\); or \(4,\), one for each initial state"):
         cpjax.sweep(cpjax.CartPole(cart_mass=np.ones(count)), CENTRED, starts, duration=0.1, **SAMPLED)
 
 

@@ -178,6 +178,7 @@ cpjax.record_sweep(sys.argv[1], plant, law, starts, duration=0.3, dt=0.002, cloc
 """
 
 
+@pytest.mark.slow
 def test_two_processes_write_the_file_that_one_writes(tmp_path):
     import socket
 

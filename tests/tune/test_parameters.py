@@ -20,6 +20,7 @@ PLANT = paper.appendix_plant()
 DESIGNS = ("lqr", "placement")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("design", "full_q"), [("lqr", False), ("lqr", True), ("placement", False)])
 def test_the_starting_vector_makes_the_controller_again(design, full_q):
     begun = baseline(design, PLANT)
@@ -41,6 +42,7 @@ def test_any_vector_makes_a_stable_regulator_and_a_gate_within_its_range(design)
         assert 0.0 < float(made.gate.half_angle) < math.pi
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("design", DESIGNS)
 def test_gradients_pass_through_the_design(design):
     free = free_parameters(baseline(design, PLANT))

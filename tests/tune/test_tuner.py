@@ -46,6 +46,7 @@ def test_stopped_at_any_checkpoint_it_ends_in_the_same_bits(tuner, tmp_path):
     assert np.all(np.isfinite(a.vector))
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_tuning_is_refused(tuner, tmp_path):
     path = tmp_path / "checkpoint.npz"
     store(path, tuner.identity, tuner.begin())
