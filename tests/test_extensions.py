@@ -106,6 +106,7 @@ def test_its_derivative_is_that_of_differences_forward_in_reverse_and_under_vmap
         assert float(reverse[i]) == pytest.approx((4 * fine - rough) / 3, rel=1e-6, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_it_runs_in_float32(example):
     controller, start = example
     with jax.numpy_dtype_promotion("standard"):  # as users have it
@@ -186,6 +187,7 @@ def test_a_replay_is_that_of_an_independent_loop_within_1e_9_over_2_s():
     assert np.max(np.abs(columns(run.state) - states)) <= 1e-9
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_replay_in_plant_and_voltages_is_that_of_differences():
     signal, start = recorded()
     target = jnp.asarray([0.3, -0.2, 1.0, 0.5])
@@ -265,6 +267,7 @@ def test_the_furuta_pendulum_follows_from_its_lagrangian():
         np.testing.assert_allclose(FURUTA.accelerations(tuple(q), tuple(v), u), expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_furuta_pendulum_is_caught_and_its_located_gradient_is_that_of_differences():
     def outside(p):
         plant = dataclasses.replace(FURUTA, pole_length=p[2], torque_per_voltage=p[3])

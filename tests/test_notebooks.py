@@ -14,7 +14,7 @@ def code_cells(path):
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, marks=[pytest.mark.slow] * (path.stem[:2] != "01")) for path in NOTEBOOKS],
+    [pytest.param(path, marks=pytest.mark.slow) for path in NOTEBOOKS],
     ids=lambda path: path.stem,
 )
 def test_its_code_runs(path, monkeypatch):

@@ -46,6 +46,8 @@ QUICK_TUNING: Mapping[str, Any] = {"candidates": 1023, "restarts": 4, "batch": 8
 """Fields of a `TuningConfig`."""
 QUICK_AUDIT: Mapping[str, Any] = {"count": 4, "duration": 3.0, "dt": 0.002}
 """Options of `cpjax audit-gradients`."""
+AUDIT_STARTS = 16
+"""Random initial guesses of each fit of `cpjax audit-gains`."""
 
 
 def setup(page: Page, setting: EvaluationConfig) -> None:
@@ -116,8 +118,8 @@ def gain_identification(page: Page, given: argparse.Namespace) -> None:
     """Adds the section on plants that explain the printed gains, and writes audit_gains.json and audit_gains.png."""
     plant, prints = paper.appendix_plant(), printed_in_the_paper()
     with progress("audit-gains") as report:
-        audit = audit_gains(prints, plant, starts=16, seed=given.seed, progress=report)
-    write(given.out / "audit_gains.json", audit, prints, plant, seed=given.seed, starts=16)
+        audit = audit_gains(prints, plant, starts=AUDIT_STARTS, seed=given.seed, progress=report)
+    write(given.out / "audit_gains.json", audit, prints, plant, seed=given.seed, starts=AUDIT_STARTS)
     page.section("Where the printed gains come from")
     page.text(
         "The printed gains do not follow from the printed parameters. Which parameters would have to differ, and what "

@@ -758,6 +758,7 @@ def report(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", buffers.StringIO())
         patch.setattr(sys, "stderr", buffers.StringIO())
+        patch.setattr(report_sections, "AUDIT_STARTS", 4)
         code = main(["report", "--out", str(folder), *EVALUATION, "--cells", "0", "--studies", "none"])
     text = (folder / "report.html").read_text(encoding="utf-8")
     return SimpleNamespace(folder=folder, code=code, text=text, page=Page(text))

@@ -471,6 +471,7 @@ def test_no_derivative_is_nan_where_a_loop_is_degenerate(loop):
     assert all(np.all(np.isfinite(part)) for part in jacobian)
 
 
+@pytest.mark.slow
 def test_the_margins_of_an_unstable_lag_have_their_textbook_derivatives_in_the_gain():
     """L = k / (s - 1) at k = 2, where the lower gain margin and the disk margin are met at frequency 0."""
     (_, _, in_K), _ = reverse((jnp.diag(jnp.asarray([1.0, -1.0])), jnp.asarray([1.0, 0.0]), jnp.asarray([2.0, 0.0])))

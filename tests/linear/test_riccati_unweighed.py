@@ -73,6 +73,7 @@ def systems():
 # --- closed forms -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_an_inverted_pendulum_without_weights_is_mirrored_at_the_least_input(dtype):
     for stiffness in (1e4, 9.81, 1e-3, 1e-8, 1e-16):
@@ -117,6 +118,7 @@ def test_a_repeated_pole_without_weight_is_mirrored_as_often_as_it_is_there():
 # --- others' solutions ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @both
 @pytest.mark.parametrize(("n", "m"), [(4, 1), pytest.param(6, 2, marks=pytest.mark.slow)])
 def test_whatever_is_not_weighed_the_gain_is_scipys_to_rounding(time, n, m, systems):
@@ -178,6 +180,7 @@ def test_units_change_no_digit_where_an_unstable_mode_has_no_weight(time):
         np.testing.assert_allclose(P * units * units[:, None], plain.P, rtol=1e-15)
 
 
+@pytest.mark.slow
 def test_weighing_position_alone_is_solved_and_angle_alone_names_the_mode_at_zero():
     A, B = (np.asarray(matrix) for matrix in linearize(paper.appendix_plant()))
     K, P = lqr(A, B, np.diag([1.0, 0.0, 0.0, 0.0]), 1e-4)

@@ -272,6 +272,7 @@ def test_gradients_of_a_gramian_are_finite_where_a_further_doubling_would_overfl
     assert float(gradient[0, 0]) == pytest.approx(math.exp(680.0) / 340.0 * (1 - 1 / 680.0), rel=1e-11)
 
 
+@pytest.mark.slow
 def test_rank_conditioning_and_their_derivatives_survive_jit_and_vmap():
     A, B = papers_model()
     shifted = jnp.stack([A, A + 0.01])

@@ -72,6 +72,7 @@ def test_without_clip_and_crossing_it_is_the_rollout_that_reads_its_mode_per_ste
         assert float(getattr(found.metrics, name)) == pytest.approx(float(getattr(other.metrics, name)), rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "gate",
     [

@@ -270,6 +270,7 @@ def test_gradients_are_finite_from_the_ugly_starts(theta, dtype):
     assert all(bool(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradients))
 
 
+@pytest.mark.slow
 def test_new_numbers_do_not_compile_again():
     cpjax.measure(PLANT, CENTRED, START, **EVALUATION)
     other = paper.controller("corrected-centred", "lqr", paper.identified_plant(), "computed")

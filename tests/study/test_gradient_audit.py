@@ -168,6 +168,7 @@ def test_arguments_that_mean_nothing_are_refused_by_name(changes, field):
     assert caught.value.field == field
 
 
+@pytest.mark.slow
 def test_a_loops_numbers_by_name_make_the_loop_again():
     state = State(0.1, 0.2, 0.4, -1.0)
     for design, gains, name in (

@@ -32,6 +32,7 @@ def test_the_starting_vector_makes_the_controller_again(design, full_q):
     assert len(free.labels) == free.physical(free.start()).shape[0] == free.start().shape[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("design", DESIGNS)
 def test_any_vector_makes_a_stable_regulator_and_a_gate_within_its_range(design):
     free = free_parameters(baseline(design, PLANT))
