@@ -12,7 +12,6 @@ from typing import Any
 MOVED = {
     "cpjax.compilation": "cpjax.backend.single_kernel",
     "cpjax.design": "cpjax.linear",
-    "cpjax.numeric.extremes": "cpjax.backend.extremes",
     "cpjax.numeric.trigonometry": "cpjax.backend.trigonometry",
     "cpjax.returned": "cpjax.checks",
     "cpjax.runtime": "cpjax.backend.runtime",

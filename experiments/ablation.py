@@ -72,11 +72,6 @@ def _stacked() -> None:
     replace("sim.sweep", "_unstacked", lambda stacks, like: jax.tree.unflatten(jax.tree.structure(like), stacks))
 
 
-def _extremes() -> None:
-    replace("controllers.energy plant.motor sim.metrics", "fast_maximum", jnp.maximum)
-    replace("plant.motor sim.metrics", "fast_minimum", jnp.minimum)
-
-
 def _sin_cos() -> None:
     modules = "controllers.energy controllers.gates plant.cartpole sim.metrics"
     replace(modules, "sin_cos", lambda angle: (jnp.sin(angle), jnp.cos(angle)))
@@ -87,7 +82,6 @@ PARTS: dict[str, Callable[[], Any]] = {
     "parts of a step as functions": _outline,
     "own sine and cosine": _sin_cos,
     "angles turned between stages": _incremental,
-    "one-instruction maximum and minimum": _extremes,
     "failures outside the loop": _fast_path,
     "results of a kind in one array": _stacked,
     "results in aligned memory": lambda: replace("sim.sweep", "_unwritten", np.empty),

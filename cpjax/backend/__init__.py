@@ -3,15 +3,12 @@
 docs/performance.md describes each part and its effect.
 """
 
-from cpjax.backend.extremes import fast_maximum, fast_minimum
 from cpjax.backend.runtime import compiler_fuses_loops, configure_cpu, jaxlib_is_tested, keep_compilations
 from cpjax.backend.trigonometry import rotate_by, sin_cos
 
 __all__ = [
     "compiler_fuses_loops",
     "configure_cpu",
-    "fast_maximum",
-    "fast_minimum",
     "jaxlib_is_tested",
     "keep_compilations",
     "rotate_by",

@@ -12,7 +12,6 @@ import math
 
 import jax.numpy as jnp
 
-from cpjax.backend.extremes import fast_maximum
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
@@ -63,5 +62,5 @@ class EnergySwingUp:
         above_rest = kinetic * (1.0 / weight) + (1.0 + cos)
         half_edge, _ = sin_cos(0.5 * self.kick_radius)  # 1 - cos(edge) = 2 sin(edge / 2)^2, without cancellation
         room = 1.0 - above_rest * (0.5 / (half_edge * half_edge))
-        inside = fast_maximum(room, 0.0)  # the cube below smooths its kink
+        inside = jnp.maximum(room, 0.0)  # the cube below smooths its kink
         return jnp.where(self.kick == 0.0, 0.0, inside * inside * inside)

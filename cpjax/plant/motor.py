@@ -2,9 +2,9 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cpjax.backend.extremes import fast_maximum, fast_minimum
 from cpjax.pytree import Scalars, number, pytree
 
 
@@ -54,7 +54,7 @@ class Motor:
 
     def saturate(self, voltage: Scalars) -> Float[Array, "*batch"]:
         """Clips the demanded voltage [V] to the supply; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
-        return fast_maximum(-self.voltage_limit, fast_minimum(self.voltage_limit, voltage))
+        return jnp.maximum(-self.voltage_limit, jnp.minimum(self.voltage_limit, voltage))
 
     def current(self, voltage: Scalars, x_dot: Scalars) -> Scalars:
         """Returns the winding current [A] at an applied voltage [V] and cart velocity [m/s]."""

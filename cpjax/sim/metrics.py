@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from cpjax.backend.extremes import fast_maximum, fast_minimum
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.errors import InputError
 from cpjax.numeric.angles import wrap_angle
@@ -221,12 +220,12 @@ class ProtocolMetrics:
             variation = variation + jnp.abs(last - first)
             effort = 0.5 * (effort + sample.elapsed * last * last)
         return _State(
-            entered=jnp.where(inside, fast_minimum(sample.time, state.entered), math.inf),
-            cart_travel=fast_maximum(state.cart_travel, travel),
+            entered=jnp.where(inside, jnp.minimum(sample.time, state.entered), math.inf),
+            cart_travel=jnp.maximum(state.cart_travel, travel),
             effort=state.effort + effort,
             voltage_variation=state.voltage_variation + variation,
-            peak_voltage=fast_maximum(state.peak_voltage, jnp.abs(sample.voltage)),
-            peak_cart_acceleration=fast_maximum(state.peak_cart_acceleration, jnp.abs(sample.cart_acceleration)),
+            peak_voltage=jnp.maximum(state.peak_voltage, jnp.abs(sample.voltage)),
+            peak_cart_acceleration=jnp.maximum(state.peak_cart_acceleration, jnp.abs(sample.cart_acceleration)),
             switches=state.switches + (sample.mode != sample.mode_before).astype(state.switches.dtype),
         )
 

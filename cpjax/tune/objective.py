@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cpjax.backend.extremes import fast_maximum
 from cpjax.errors import InputError
 from cpjax.fields import renamed
 from cpjax.plant import CartPole
@@ -145,7 +144,7 @@ class Travel:
         return jnp.zeros_like(sample.time)
 
     def update(self, state: Float[Array, ""], sample: Sample) -> Float[Array, ""]:
-        return fast_maximum(state, jnp.abs(sample.state.x))
+        return jnp.maximum(state, jnp.abs(sample.state.x))
 
     def finalize(self, state: Float[Array, ""], last: Sample) -> Float[Array, ""]:
         return state

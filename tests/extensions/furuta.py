@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 
 import cpjax
-from cpjax.backend.extremes import fast_maximum, fast_minimum
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.numeric.angles import wrap_angle
 from cpjax.pytree import Scalar, matrix, number, part, pytree
@@ -52,7 +51,7 @@ class Furuta:
         return FurutaState(q[0], v[0], q[1], v[1])
 
     def saturate(self, command):
-        return fast_maximum(-self.input_limit, fast_minimum(self.input_limit, command))
+        return jnp.maximum(-self.input_limit, jnp.minimum(self.input_limit, command))
 
     def accelerations(self, q, v, u):
         sin, cos = sin_cos(q[1])
