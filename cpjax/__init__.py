@@ -19,7 +19,9 @@ from cpjax.controllers import (
     SWING_UP,
     AngleGate,
     AngleRateGate,
+    Digital,
     EnergySwingUp,
+    FilteredDerivative,
     Hybrid,
     LqrWeights,
     LyapunovGate,
@@ -39,6 +41,7 @@ from cpjax.linear.riccati import care, dare
 from cpjax.numeric.quantisation import quantize
 from cpjax.plant import HANGING, UPRIGHT, CartPole, LinearModel, Motor, State, linearize, sample_starts
 from cpjax.presets import preset
+from cpjax.rig import Drive, Encoders, Rig, Track
 from cpjax.sim.flags import Flag
 from cpjax.sim.gradients import Gradients, gradients
 from cpjax.sim.metrics import Metrics, ProtocolMetrics, TimeOutside
@@ -62,7 +65,11 @@ __all__ = [
     "CartPole",
     "DamagedFileWarning",
     "DerivativeWarning",
+    "Digital",
+    "Drive",
+    "Encoders",
     "EnergySwingUp",
+    "FilteredDerivative",
     "Flag",
     "Gradients",
     "Hybrid",
@@ -76,12 +83,14 @@ __all__ = [
     "PoleFactors",
     "ProtocolMetrics",
     "QuadraticFactors",
+    "Rig",
     "Simulation",
     "SmoothClip",
     "SmoothHybrid",
     "State",
     "StateFeedback",
     "TimeOutside",
+    "Track",
     "Trajectory",
     "VoltageSignal",
     "__version__",

@@ -28,6 +28,7 @@ LAYERS = [
     "numeric",
     "linear",
     "plant",
+    "rig",
     "controllers",
     "sim",
     "io",

@@ -1,0 +1,8 @@
+"""What stands on the bench beside the plant: sensors, drive and track."""
+
+from cpjax.rig.bench import Position, Rig
+from cpjax.rig.drive import Drive
+from cpjax.rig.sensors import Encoders
+from cpjax.rig.track import Track
+
+__all__ = ["Drive", "Encoders", "Position", "Rig", "Track"]
