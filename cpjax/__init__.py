@@ -39,9 +39,20 @@ from cpjax.linear.lqr import dlqr, lqr
 from cpjax.linear.placement import QuadraticFactors, place, place_polynomial
 from cpjax.linear.riccati import care, dare
 from cpjax.numeric.quantisation import quantize
-from cpjax.plant import HANGING, UPRIGHT, CartPole, LinearModel, Motor, State, linearize, sample_starts
+from cpjax.plant import (
+    HANGING,
+    UPRIGHT,
+    CartPole,
+    ForceActuator,
+    LinearModel,
+    LumpedMotor,
+    Motor,
+    State,
+    linearize,
+    sample_starts,
+)
 from cpjax.presets import preset
-from cpjax.rig import Drive, Encoders, Rig, Track
+from cpjax.rig import Drive, Encoders, Rig, Track, rig
 from cpjax.sim.flags import Flag
 from cpjax.sim.gradients import Gradients, gradients
 from cpjax.sim.metrics import Metrics, ProtocolMetrics, TimeOutside
@@ -71,11 +82,13 @@ __all__ = [
     "EnergySwingUp",
     "FilteredDerivative",
     "Flag",
+    "ForceActuator",
     "Gradients",
     "Hybrid",
     "InputError",
     "LinearModel",
     "LqrWeights",
+    "LumpedMotor",
     "LyapunovGate",
     "Metrics",
     "Motor",
@@ -113,6 +126,7 @@ __all__ = [
     "quantize",
     "read_sweep",
     "record_sweep",
+    "rig",
     "rollout",
     "sample_starts",
     "save",

@@ -2,7 +2,8 @@
 
 from cpjax.rig.bench import Position, Rig
 from cpjax.rig.drive import Drive
+from cpjax.rig.presets import PRESETS, rig
 from cpjax.rig.sensors import Encoders
 from cpjax.rig.track import Track
 
-__all__ = ["Drive", "Encoders", "Position", "Rig", "Track"]
+__all__ = ["PRESETS", "Drive", "Encoders", "Position", "Rig", "Track", "rig"]

@@ -13,6 +13,7 @@ from oracles import HybridOracle, derivative
 import cpjax
 from cpjax import Digital, Drive, Encoders, FilteredDerivative, InputError, Rig, State, Track, paper
 from cpjax.numeric.noise import random_bits, standard_normals
+from cpjax.rig import PRESETS
 
 PLANT = paper.appendix_plant()
 LAW = paper.controller("corrected-centred", "placement", PLANT)
@@ -145,3 +146,36 @@ def test_what_no_rig_can_be_is_refused_by_name(call, field):
     with pytest.raises(InputError) as caught:
         call()
     assert field in caught.value.field
+
+
+def test_a_lumped_motor_is_the_motor_with_its_lumps():
+    motor = cpjax.Motor(torque_constant=0.03, back_emf_constant=0.02, resistance=2.0, wheel_radius=0.01, gear_ratio=3.0)
+    lumped = cpjax.LumpedMotor(motor.force_per_voltage, motor.damping, motor.reflected_mass, motor.voltage_limit)
+    for u, v in ((3.0, -0.4), (-11.0, 1.2)):
+        assert float(lumped.force(u, v)) == pytest.approx(float(motor.force(u, v)), rel=1e-14)
+        assert float(lumped.voltage_for_force(lumped.force(u, v), v)) == pytest.approx(u)
+    plants = [dataclasses.replace(PLANT, motor=one) for one in (motor, lumped)]
+    one, other = (np.asarray(cpjax.linearize(plant).A) for plant in plants)
+    np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+def test_published_gains_follow_from_the_public_rigs():
+    # Control Tutorials for MATLAB and Simulink: Q = diag(5000, 0, 100, 0), R = 1; its angle has the other sign.
+    K = cpjax.lqr(*cpjax.linearize(cpjax.rig("ctms").plant), jnp.diag(jnp.array([5000.0, 0.0, 100.0, 0.0])), 1.0).K
+    np.testing.assert_allclose(K[0], [-70.7107, -37.8345, -105.5298, -20.9238], atol=6e-5)
+    # MathWorks File Exchange 97182: Q = diag(200, 0, 1000, 0), R = 0.035; its angle has the other sign.
+    K = cpjax.lqr(
+        *cpjax.linearize(cpjax.rig("fileexchange-97182").plant), jnp.diag(jnp.array([200.0, 0.0, 1000.0, 0.0])), 0.035
+    ).K
+    np.testing.assert_allclose(K[0], [-75.5929, -63.5585, -212.5131, -19.3977], rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_rig_by_name_comes_back_from_a_file(name, tmp_path):
+    rig = cpjax.rig(name)
+    for suffix in ("toml", "json"):
+        cpjax.save(tmp_path / f"rig.{suffix}", rig)
+        again = cpjax.load(tmp_path / f"rig.{suffix}")
+        assert jax.tree.structure(again) == jax.tree.structure(rig)
+        assert jax.tree.leaves(again) == jax.tree.leaves(rig)
+    assert PRESETS[name].source
