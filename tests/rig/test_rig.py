@@ -160,14 +160,14 @@ def test_a_lumped_motor_is_the_motor_with_its_lumps():
 
 
 def test_published_gains_follow_from_the_public_rigs():
-    # Control Tutorials for MATLAB and Simulink: Q = diag(5000, 0, 100, 0), R = 1; its angle has the other sign.
+    # Control Tutorials for MATLAB and Simulink: Q = diag(5000, 0, 100, 0), R = 1.
     K = cpjax.lqr(*cpjax.linearize(cpjax.rig("ctms").plant), jnp.diag(jnp.array([5000.0, 0.0, 100.0, 0.0])), 1.0).K
-    np.testing.assert_allclose(K[0], [-70.7107, -37.8345, -105.5298, -20.9238], atol=6e-5)
-    # MathWorks File Exchange 97182: Q = diag(200, 0, 1000, 0), R = 0.035; its angle has the other sign.
+    np.testing.assert_allclose(K[0], [-70.7107, -37.8345, 105.5298, 20.9238], atol=6e-5)
+    # MathWorks File Exchange 97182: Q = diag(200, 0, 1000, 0), R = 0.035.
     K = cpjax.lqr(
         *cpjax.linearize(cpjax.rig("fileexchange-97182").plant), jnp.diag(jnp.array([200.0, 0.0, 1000.0, 0.0])), 0.035
     ).K
-    np.testing.assert_allclose(K[0], [-75.5929, -63.5585, -212.5131, -19.3977], rtol=1e-3)
+    np.testing.assert_allclose(K[0], [-75.5929, -63.5585, 212.5131, 19.3977], rtol=1e-3)
 
 
 @pytest.mark.parametrize("name", PRESETS)
