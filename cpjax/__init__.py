@@ -25,16 +25,19 @@ from cpjax.controllers import (
     Hybrid,
     LqrWeights,
     LyapunovGate,
+    Observer,
     PoleFactors,
     SmoothClip,
     SmoothHybrid,
     StateFeedback,
     VoltageSignal,
     as_sampled,
+    kalman_observer,
 )
 from cpjax.errors import DamagedFileWarning, DerivativeWarning, InputError, PerformanceWarning
 from cpjax.io import load, save
 from cpjax.linear.discretization import discretize, discretize_cost
+from cpjax.linear.estimation import dlqe
 from cpjax.linear.lqr import dlqr, lqr
 from cpjax.linear.placement import QuadraticFactors, place, place_polynomial
 from cpjax.linear.riccati import care, dare
@@ -92,6 +95,7 @@ __all__ = [
     "LyapunovGate",
     "Metrics",
     "Motor",
+    "Observer",
     "PerformanceWarning",
     "PoleFactors",
     "ProtocolMetrics",
@@ -113,8 +117,10 @@ __all__ = [
     "dare",
     "discretize",
     "discretize_cost",
+    "dlqe",
     "dlqr",
     "gradients",
+    "kalman_observer",
     "linearize",
     "load",
     "lqr",

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import control
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -179,3 +180,45 @@ def test_a_rig_by_name_comes_back_from_a_file(name, tmp_path):
         assert jax.tree.structure(again) == jax.tree.structure(rig)
         assert jax.tree.leaves(again) == jax.tree.leaves(rig)
     assert PRESETS[name].source
+
+
+def test_the_kalman_gain_is_python_controls():
+    A, _ = cpjax.discretize(*cpjax.linearize(PLANT), 0.002)
+    C = np.eye(4)[[0, 2]]
+    G = np.eye(4)[:, [1, 3]] * 0.002
+    for QN, RN in ((np.diag([1.0, 100.0]), np.diag([1e-9, 1e-7])), (np.array([[2.0, 0.5], [0.5, 3.0]]), np.eye(2))):
+        L, _, _ = control.dlqe(np.asarray(A), G, C, QN, RN)
+        found = cpjax.dlqe(A, G, C, QN, RN)
+        np.testing.assert_allclose(found.L, L, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(np.asarray(A) @ found.filter, L, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("period", [0.001, 0.005, 0.02])
+def test_an_observer_halves_the_filtered_derivatives_velocity_error(period):
+    sensors = Encoders(x_step=2e-4, theta_step=2 * math.pi / 2000)
+    observer = cpjax.kalman_observer(
+        PLANT, period=period, x_deviation=2e-4 / 12**0.5, theta_deviation=2 * math.pi / 2000 / 12**0.5
+    ).at_period(period)
+    run = cpjax.rollout(PLANT, LAW, START, duration=3.0, dt=0.001, control_period=period)
+    every = round(period / 0.001)
+    states = np.asarray(run.state.vector())[::every]
+    commands = np.asarray(run.voltage)[::every]
+    zero = (jnp.uint32(0), jnp.uint32(0))
+
+    def errors(estimator):
+        def step(carry, row):
+            memory, before = carry
+            state, command = row
+            measured = sensors.measure(State.from_vector(state), zero, zero)
+            memory, estimate = estimator.update(memory, measured, before)
+            return (memory, command), estimate.vector() - state
+
+        first = sensors.measure(State.from_vector(jnp.asarray(states[0])), zero, zero)
+        carry = (estimator.init(first), jnp.zeros(()))
+        _, found = jax.lax.scan(step, carry, (jnp.asarray(states), jnp.asarray(commands)))
+        settled = np.asarray(found)[round(0.3 / period) :]
+        return np.sqrt(np.mean(settled[:, [1, 3]] ** 2, axis=0))
+
+    cutoffs = np.geomspace(10.0, 3.0 / period, 25)
+    best = np.min([errors(FilteredDerivative(cutoff=c).at_period(period)) for c in cutoffs], axis=0)
+    assert np.all(errors(observer) <= 0.5 * best)
