@@ -182,8 +182,8 @@ def kalman_observer(
     period: float,
     x_deviation: float,
     theta_deviation: float,
-    acceleration_deviation: float = 1.0,
-    angular_acceleration_deviation: float = 10.0,
+    acceleration_deviation: float = 0.3,
+    angular_acceleration_deviation: float = 1.0,
 ) -> Observer:
     """Designs an `Observer` whose gain is that of a steady Kalman filter upright.
 

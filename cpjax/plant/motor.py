@@ -106,7 +106,7 @@ class LumpedMotor:
 
     def saturate(self, voltage: Scalars) -> Float[Array, "*batch"]:
         """Clips the demanded voltage [V] to the supply; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
-        return fast_maximum(-self.voltage_limit, fast_minimum(self.voltage_limit, voltage))
+        return jnp.maximum(-self.voltage_limit, jnp.minimum(self.voltage_limit, voltage))
 
     def force(self, voltage: Scalars, x_dot: Scalars) -> Scalars:
         """Returns the force on the cart [N] at an applied voltage [V] and cart velocity [m/s]."""
@@ -145,7 +145,7 @@ class ForceActuator:
 
     def saturate(self, command: Scalars) -> Float[Array, "*batch"]:
         """Clips the commanded force [N]; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
-        return fast_maximum(-self.limit, fast_minimum(self.limit, command))
+        return jnp.maximum(-self.limit, jnp.minimum(self.limit, command))
 
     def force(self, command: Scalars, x_dot: Scalars) -> Scalars:
         """Returns the force on the cart [N], the command itself."""

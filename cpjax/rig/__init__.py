@@ -1,4 +1,4 @@
-"""What stands on the bench beside the plant: sensors, drive and track."""
+"""Parts of a rig beside its plant: sensors, drive and track."""
 
 from cpjax.rig.bench import Position, Rig
 from cpjax.rig.drive import Drive
