@@ -19,26 +19,43 @@ from cpjax.controllers import (
     SWING_UP,
     AngleGate,
     AngleRateGate,
+    Digital,
     EnergySwingUp,
+    FilteredDerivative,
     Hybrid,
     LqrWeights,
     LyapunovGate,
+    Observer,
     PoleFactors,
     SmoothClip,
     SmoothHybrid,
     StateFeedback,
     VoltageSignal,
     as_sampled,
+    kalman_observer,
 )
 from cpjax.errors import DamagedFileWarning, DerivativeWarning, InputError, PerformanceWarning
 from cpjax.io import load, save
 from cpjax.linear.discretization import discretize, discretize_cost
+from cpjax.linear.estimation import dlqe
 from cpjax.linear.lqr import dlqr, lqr
 from cpjax.linear.placement import QuadraticFactors, place, place_polynomial
 from cpjax.linear.riccati import care, dare
 from cpjax.numeric.quantisation import quantize
-from cpjax.plant import HANGING, UPRIGHT, CartPole, LinearModel, Motor, State, linearize, sample_starts
+from cpjax.plant import (
+    HANGING,
+    UPRIGHT,
+    CartPole,
+    ForceActuator,
+    LinearModel,
+    LumpedMotor,
+    Motor,
+    State,
+    linearize,
+    sample_starts,
+)
 from cpjax.presets import preset
+from cpjax.rig import Drive, Encoders, Rig, Track, rig
 from cpjax.sim.flags import Flag
 from cpjax.sim.gradients import Gradients, gradients
 from cpjax.sim.metrics import Metrics, ProtocolMetrics, TimeOutside
@@ -62,26 +79,35 @@ __all__ = [
     "CartPole",
     "DamagedFileWarning",
     "DerivativeWarning",
+    "Digital",
+    "Drive",
+    "Encoders",
     "EnergySwingUp",
+    "FilteredDerivative",
     "Flag",
+    "ForceActuator",
     "Gradients",
     "Hybrid",
     "InputError",
     "LinearModel",
     "LqrWeights",
+    "LumpedMotor",
     "LyapunovGate",
     "Metrics",
     "Motor",
+    "Observer",
     "PerformanceWarning",
     "PoleFactors",
     "ProtocolMetrics",
     "QuadraticFactors",
+    "Rig",
     "Simulation",
     "SmoothClip",
     "SmoothHybrid",
     "State",
     "StateFeedback",
     "TimeOutside",
+    "Track",
     "Trajectory",
     "VoltageSignal",
     "__version__",
@@ -91,8 +117,10 @@ __all__ = [
     "dare",
     "discretize",
     "discretize_cost",
+    "dlqe",
     "dlqr",
     "gradients",
+    "kalman_observer",
     "linearize",
     "load",
     "lqr",
@@ -104,6 +132,7 @@ __all__ = [
     "quantize",
     "read_sweep",
     "record_sweep",
+    "rig",
     "rollout",
     "sample_starts",
     "save",

@@ -19,10 +19,13 @@ from cpjax._moved import moved_attribute
 from cpjax.controllers import (
     AngleGate,
     AngleRateGate,
+    Digital,
     EnergySwingUp,
+    FilteredDerivative,
     Hybrid,
     LqrWeights,
     LyapunovGate,
+    Observer,
     PoleFactors,
     SingleLaw,
     SmoothClip,
@@ -31,9 +34,10 @@ from cpjax.controllers import (
 )
 from cpjax.errors import InputError
 from cpjax.files import dump_json, read_table, suffix_of, write_text
-from cpjax.plant import CartPole, Motor
+from cpjax.plant import CartPole, ForceActuator, LumpedMotor, Motor
 from cpjax.plant.state import State
 from cpjax.pytree import is_traced
+from cpjax.rig import Drive, Encoders, Rig, Track
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import Trajectory
 
@@ -63,6 +67,15 @@ TYPES: dict[str, type] = {
         SingleLaw,
         SmoothHybrid,
         SmoothClip,
+        LumpedMotor,
+        ForceActuator,
+        Encoders,
+        Drive,
+        Track,
+        Rig,
+        Digital,
+        FilteredDerivative,
+        Observer,
         ProtocolMetrics,
         Metrics,
         Trajectory,

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from tables import rows
 
+import cpjax
 from cpjax import (
     AngleGate,
     AngleRateGate,
@@ -93,6 +94,23 @@ THINGS = {
         flag=np.array(2, dtype=np.int32),
         metrics=METRICS,
     ),
+}
+RIG = cpjax.Rig(
+    PLANT,
+    sensors=cpjax.Encoders(1e-4, 1e-3, theta_offset=0.1),
+    drive=cpjax.Drive(delay=0.1),
+    track=cpjax.Track(0.4),
+)
+THINGS |= {
+    "Rig": RIG,
+    "Encoders": RIG.sensors,
+    "Drive": RIG.drive,
+    "Track": RIG.track,
+    "LumpedMotor": cpjax.LumpedMotor(2.0 / 3.0),
+    "ForceActuator": cpjax.ForceActuator(math.inf),
+    "FilteredDerivative": cpjax.FilteredDerivative(100.0 / 3.0),
+    "Observer": cpjax.Observer(PLANT, np.ones((4, 2)) / 3.0),
+    "Digital": cpjax.Digital(LAW, cpjax.FilteredDerivative(30.0), dead_band=0.1),
 }
 every_thing = rows("thing", THINGS.values(), ids=THINGS)
 both_formats = rows("extension", ["json", "toml"])

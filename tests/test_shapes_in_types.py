@@ -54,7 +54,7 @@ def calls():
     from cpjax.linear.placement import QuadraticFactors
     from cpjax.linear.structure import Structure
     from cpjax.numeric.double_word import DoubleWord
-    from cpjax.plant import CartPole, Motor, State
+    from cpjax.plant import CartPole, ForceActuator, LumpedMotor, Motor, State
 
     # Five states and two inputs, so that no two axes of a matrix are equally long by chance.
     A = jnp.diag(-jnp.arange(1.0, 6.0)) + jnp.diag(jnp.full(4, 0.3), 1)
@@ -72,6 +72,10 @@ def calls():
     hybrid = c.Hybrid(swing_up, law, gate)
     memory, single, sampled = c.ModeMemory(mode), c.SingleLaw(law), c.Sampled(hybrid)
     signal = c.VoltageSignal(np.arange(3.0), np.ones(3), period)
+    words, seen = jnp.arange(3, dtype=jnp.uint32), State(one, one, one, one)
+    lumped, actuator = LumpedMotor(2.0), ForceActuator()
+    filtered, observer = c.FilteredDerivative(10.0, period), c.Observer(plant, np.ones((4, 2)), period)
+    digital = c.Digital(law, filtered)
     square = {"function": lambda h: (np.array([h, h * h]), np.array([-h, h * h])), "steps": np.array([0.4, 0.2, 0.1])}
     costs = np.array([[1.0, 3.0], [2.0, 2.0], [3.0, 3.0]])
     return {
@@ -85,6 +89,7 @@ def calls():
         "linear.arguments.column": call("B", b, 5),
         "linear.discretization.discretize": call(A, B, period),
         "linear.discretization.discretize_cost": call(A, b, Q, one, period),
+        "linear.estimation.dlqe": call(0.1 * A, B, C, R, jnp.eye(3)),
         "linear.limits.demanded_voltage": call(gain, jnp.ones(3)),
         "linear.limits.saturation_angle": call(gain[0], 12.0),
         "linear.limits.lyapunov_function": call(A, B, K, Q),
@@ -133,6 +138,8 @@ def calls():
         "numeric.double_word.negative": call(word),
         "numeric.double_word.multiply": call(word, word),
         "numeric.double_word.divide": call(word, word),
+        "numeric.noise.random_bits": call((words, words), (words, words)),
+        "numeric.noise.standard_normals": call((words, words), (words, words), np.dtype(float)),
         "numeric.pareto.nondominated": call(costs),
         "numeric.pareto.hypervolume": call(costs, np.array([4.0, 4.0])),
         "numeric.quantisation.quantize": call(jnp.ones((2, 3)), 0.1, derivative="straight_through"),
@@ -190,6 +197,16 @@ def calls():
         "plant.motor.Motor.force_per_voltage": call(motor),
         "plant.motor.Motor.damping": call(motor),
         "plant.motor.Motor.reflected_mass": call(motor),
+        "plant.motor.LumpedMotor.saturate": call(lumped, jnp.ones(3)),
+        "plant.motor.LumpedMotor.force": call(lumped, jnp.ones(3), jnp.ones(3)),
+        "plant.motor.LumpedMotor.voltage_for_force": call(lumped, 1.0, 0.1),
+        "plant.motor.ForceActuator.saturate": call(actuator, jnp.ones(3)),
+        "plant.motor.ForceActuator.force": call(actuator, jnp.ones(3), jnp.ones(3)),
+        "plant.motor.ForceActuator.voltage_for_force": call(actuator, 1.0, 0.1),
+        "plant.motor.ForceActuator.force_per_voltage": call(actuator),
+        "plant.motor.ForceActuator.damping": call(actuator),
+        "plant.motor.ForceActuator.reflected_mass": call(actuator),
+        "plant.motor.ForceActuator.voltage_limit": call(actuator),
         "plant.parameters.parameters_of": call(plant),
         "plant.parameters.parameter": call(plant, "gear_ratio"),
         "plant.parameters.with_parameters": call(plant, {"cart_mass": 1.1, "resistance": 2.0}),
@@ -197,6 +214,15 @@ def calls():
         "plant.state.State.from_vector": call(State, jnp.ones((3, 4))),
         "plant.state.deviation": call(state, state),
         "plant.state.checked_reference": call("reference", state),
+        "controllers.digital.FilteredDerivative.at_period": call(filtered, period),
+        "controllers.digital.FilteredDerivative.init": call(filtered, state),
+        "controllers.digital.FilteredDerivative.update": call(filtered, filtered.init(seen), seen, one),
+        "controllers.digital.Observer.at_period": call(observer, period),
+        "controllers.digital.Observer.init": call(observer, state),
+        "controllers.digital.Observer.update": call(observer, observer.init(seen), seen, one),
+        "controllers.digital.Digital.init": call(digital, state),
+        "controllers.digital.Digital.update": call(digital, digital.init(seen), seen),
+        "controllers.digital.kalman_observer": call(plant, period=0.01, x_deviation=1e-4, theta_deviation=1e-3),
         "controllers.energy.EnergySwingUp.acceleration": call(swing_up, state),
         "controllers.energy.EnergySwingUp.voltage": call(swing_up, state),
         "controllers.feedback.LqrWeights.solve": call(weights, P, jnp.ones((4, 1))),
@@ -241,7 +267,15 @@ def calls():
     }
 
 
-NOT_TRACED = ("numeric.differences", "numeric.pareto", "numeric.statistics", "plant.initial_states", "from_poles")
+NOT_TRACED = (
+    "kalman_observer",
+    "standard_normals",
+    "numeric.differences",
+    "numeric.pareto",
+    "numeric.statistics",
+    "plant.initial_states",
+    "from_poles",
+)
 """Names of what takes and returns NumPy arrays or Python numbers, or needs known numbers."""
 
 

@@ -1,5 +1,6 @@
 """Controllers: laws, gates (switching regions), and the hybrid controller that combines them."""
 
+from cpjax.controllers.digital import Digital, Estimator, FilteredDerivative, Observer, kalman_observer
 from cpjax.controllers.energy import EnergySwingUp
 from cpjax.controllers.feedback import Design, DesignName, LqrWeights, PoleFactors, StateFeedback
 from cpjax.controllers.gates import AngleGate, AngleRateGate, Gate, LyapunovGate
@@ -30,7 +31,10 @@ __all__ = [
     "Controller",
     "Design",
     "DesignName",
+    "Digital",
     "EnergySwingUp",
+    "Estimator",
+    "FilteredDerivative",
     "Gate",
     "Hybrid",
     "Law",
@@ -38,6 +42,7 @@ __all__ = [
     "LyapunovGate",
     "ModalController",
     "ModeMemory",
+    "Observer",
     "PoleFactors",
     "Sampled",
     "SingleLaw",
@@ -48,4 +53,5 @@ __all__ = [
     "VoltageSignal",
     "as_controller",
     "as_sampled",
+    "kalman_observer",
 ]

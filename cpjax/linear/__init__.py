@@ -4,6 +4,7 @@
 """
 
 from cpjax.linear.discretization import SampledCost, SampledModel, discretize, discretize_cost
+from cpjax.linear.estimation import KalmanGain, dlqe
 from cpjax.linear.limits import (
     demanded_voltage,
     level_within_angle,
@@ -37,6 +38,7 @@ from cpjax.linear.structure import (
 
 __all__ = [
     "POSITION_AND_ANGLE",
+    "KalmanGain",
     "LinearQuadratic",
     "Margins",
     "QuadraticFactors",
@@ -54,6 +56,7 @@ __all__ = [
     "demanded_voltage",
     "discretize",
     "discretize_cost",
+    "dlqe",
     "level_within_angle",
     "level_within_angle_and_rate",
     "level_within_form",

@@ -3,7 +3,7 @@
 from cpjax.plant.cartpole import CartPole
 from cpjax.plant.initial_states import sample_starts
 from cpjax.plant.linearization import LinearModel, linearize
-from cpjax.plant.motor import Motor
+from cpjax.plant.motor import ForceActuator, LumpedMotor, Motor
 from cpjax.plant.parameters import parameter, parameters_of, with_parameters
 from cpjax.plant.state import HANGING, UPRIGHT, State
 
@@ -11,7 +11,9 @@ __all__ = [
     "HANGING",
     "UPRIGHT",
     "CartPole",
+    "ForceActuator",
     "LinearModel",
+    "LumpedMotor",
     "Motor",
     "State",
     "linearize",

@@ -77,7 +77,9 @@ class CartPole:
         drawn=_fifth_of_critical_damping,
         change=0.01,
     )
-    motor: Motor = part("a cpjax.Motor", "saturate", "force", "reflected_mass", default_factory=Motor)
+    motor: Any = part(
+        "a cpjax.Motor, LumpedMotor or ForceActuator", "saturate", "force", "reflected_mass", default_factory=Motor
+    )
 
     @classmethod
     def rod(cls, *, mass: Scalars, length: Scalars, **others: Any) -> "CartPole":

@@ -1,4 +1,4 @@
-"""Drive: a DC motor without inductance, a gear and a wheel."""
+"""Drives of the cart: a DC motor without inductance with gear and wheel, its lumped form, and a force."""
 
 from typing import Any
 
@@ -91,3 +91,66 @@ class Motor:
         """Rotor inertia as an equivalent mass at the cart [kg]: n^2 J_m / r^2."""
         ratio = self.gear_ratio / self.wheel_radius
         return ratio * ratio * self.rotor_inertia
+
+
+@pytree
+class LumpedMotor:
+    """A drive known by what moves the cart: force per voltage, and a damping that contains the back-EMF."""
+
+    force_per_voltage: Scalars = number("N/V", "force on the cart per terminal voltage", above=0.0, uncertain=True)
+    damping: Scalars = number("N s/m", "damping of the cart by the drive, back-EMF included", at_least=0.0, default=0.0)
+    reflected_mass: Scalars = number("kg", "rotor as an equivalent mass at the cart", at_least=0.0, default=0.0)
+    voltage_limit: Scalars = number(
+        "V", "supply: |u| is clipped here", default=12.0, above=0.0, infinite=True, linear=False
+    )
+
+    def saturate(self, voltage: Scalars) -> Float[Array, "*batch"]:
+        """Clips the demanded voltage [V] to the supply; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
+        return jnp.maximum(-self.voltage_limit, jnp.minimum(self.voltage_limit, voltage))
+
+    def force(self, voltage: Scalars, x_dot: Scalars) -> Scalars:
+        """Returns the force on the cart [N] at an applied voltage [V] and cart velocity [m/s]."""
+        return self.force_per_voltage * voltage - self.damping * x_dot
+
+    def voltage_for_force(self, force: Scalars, x_dot: Scalars) -> Scalars:
+        """Returns the unclipped terminal voltage [V] for a force [N] at cart velocity `x_dot` [m/s]."""
+        return (force + self.damping * x_dot) * (1.0 / self.force_per_voltage)
+
+
+@pytree
+class ForceActuator:
+    """A drive without dynamics: the command is the force on the cart [N], and "voltage" means that force."""
+
+    limit: Scalars = number("N", "|force| is clipped here", default=10.0, above=0.0, infinite=True, linear=False)
+
+    @property
+    def voltage_limit(self) -> Scalars:
+        """The limit of the command [N]."""
+        return self.limit
+
+    @property
+    def reflected_mass(self) -> float:
+        """Mass that the drive adds to the cart: none."""
+        return 0.0
+
+    @property
+    def damping(self) -> float:
+        """Damping that the drive adds to the cart: none."""
+        return 0.0
+
+    @property
+    def force_per_voltage(self) -> float:
+        """Force per command: 1."""
+        return 1.0
+
+    def saturate(self, command: Scalars) -> Float[Array, "*batch"]:
+        """Clips the commanded force [N]; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
+        return jnp.maximum(-self.limit, jnp.minimum(self.limit, command))
+
+    def force(self, command: Scalars, x_dot: Scalars) -> Scalars:
+        """Returns the force on the cart [N], the command itself."""
+        return command
+
+    def voltage_for_force(self, force: Scalars, x_dot: Scalars) -> Scalars:
+        """Returns the command for a force [N], the force itself."""
+        return force

@@ -5,6 +5,7 @@ computation: that of `per_step.py` or that of `located.py`.
 """
 
 import functools
+import itertools
 import warnings
 from typing import Any, Unpack
 
@@ -25,7 +26,9 @@ from cpjax.controllers.protocol import (
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.pytree import as_arguments, check, pytree, reveal
+from cpjax.rig import Rig
 from cpjax.sim import located, per_step
+from cpjax.sim.bench import Bench, on_bench
 from cpjax.sim.derivatives import may_switch, watched
 from cpjax.sim.flags import NEEDS_RECOMPUTE
 from cpjax.sim.initial import checked_initial
@@ -137,6 +140,8 @@ def prepared(
     Raises:
       InputError: as `rollout` does.
     """
+    rig = plant if isinstance(plant, Rig) else None
+    plant = plant if rig is None else rig.dynamics
     check_plant(plant)
     settings = check_settings(**simulation, events=has_events(plant))
     name = "starts" if batched else "start"
@@ -153,9 +158,9 @@ def prepared(
         if not hasattr(plant, "input_limit"):
             raise InputError("plant", plant, "one with input_limit, for located switching on the continuous clock")
     if metrics is None:
-        if not isinstance(plant, CartPole) and settings.save_every is None:
+        if rig is None and not isinstance(plant, CartPole) and settings.save_every is None:
             raise InputError("metrics", None, "given: the default ProtocolMetrics() are those of a cpjax.CartPole")
-        metrics = default_metrics(plant)
+        metrics = default_metrics(plant if rig is None else rig)
     present = {name for name in ("init", "update", "finalize", "finish") if callable(getattr(metrics, name, None))}
     if isinstance(metrics, type) or not present >= {"init", "update"} or not present & {"finalize", "finish"}:
         raise InputError("metrics", metrics, "a metric with init, update and finalize, such as cpjax.ProtocolMetrics()")
@@ -163,14 +168,25 @@ def prepared(
         message = f"{type(metrics).__name__}.finish is now called finalize; the old name goes with version 0.3"
         warnings.warn(message, DeprecationWarning, stacklevel=3)
     parts: tuple[tuple[str, Any], ...] = (("plant", plant), ("controller", controller), ("metrics", metrics))
-    each = [leaf for name, part in parts for leaf in check(name, part, count)]
+    each = {name: check(name, part, count) for name, part in parts}
+    if rig is not None:
+        runs = np.zeros((), np.uint32) if count is None else np.arange(count, dtype=np.uint32)
+        bare = controller
+        controller, settings = on_bench(
+            rig, controller, settings, float(simulation["dt"]), simulation.get("seed", 0), runs
+        )
+        if controller is not bare:
+            each["controller"] += [*check("rig.sensors", rig.sensors, count), False, count is not None]
+    parts = (("plant", plant), ("controller", controller), ("metrics", metrics))
     plant, controller, metrics = (as_arguments(name, part, dtype) for name, part in parts)
     dt = np.asarray(simulation["dt"], dtype=dtype)
-    return start, (plant, controller, metrics, dt), settings, [*each, False]
+    return start, (plant, controller, metrics, dt), settings, [*itertools.chain(*each.values()), False]
 
 
 def default_metrics(plant: Any) -> Metric:
     """Returns the default metric of a rollout: `ProtocolMetrics()` for a `CartPole`, `NoMetrics()` for other plants."""
+    if isinstance(plant, Rig):
+        return ProtocolMetrics() if plant.track is None else ProtocolMetrics(track_limit=plant.track.half_length)
     return ProtocolMetrics() if isinstance(plant, CartPole) else NoMetrics()
 
 
@@ -190,7 +206,8 @@ def simulate(
     """
     plant, controller, metric = reveal((plant, controller, metric))
     if settings.clock == "sampled":
-        controller = at_period(controller, dt * settings.steps_per_control)
+        every = settings.steps_per_control * (controller.divider if isinstance(controller, Bench) else 1)
+        controller = at_period(controller, dt * every)
     blind = settings.switching == "per_step" or settings.clock == "sampled"
     if blind and settings.derivative is None and may_switch(controller, start):
         start, plant, controller = watched((start, plant, controller))

@@ -39,6 +39,8 @@ class Simulation(TypedDict, total=False):
       derivative: where the instant of a change of mode does not move with the parameters, because it falls on a control
         instant, "pathwise" omits its effect; "mean", on the sampled clock, adds it: the result is the derivative of the
         mean over initial states (see docs/gradients.md). Without either, differentiating such a loop warns.
+      seed: of the noise of a rig's sensors, 0 by default. Each initial state of a sweep has noise of its own, which
+        depends on its place in the set alone.
     """
 
     duration: Required[float]
@@ -51,6 +53,7 @@ class Simulation(TypedDict, total=False):
     spare_steps: int | None
     checkpoint: Checkpoint
     derivative: Derivative | None
+    seed: int
 
 
 class Settings(NamedTuple):
@@ -99,6 +102,7 @@ def check_settings(
     spare_steps: Any = None,
     checkpoint: Any = "segments",
     derivative: Any = None,
+    seed: Any = 0,
     events: bool = False,
 ) -> Settings:
     """Checks the arguments of `Simulation` and returns the settings of a rollout.
@@ -139,6 +143,8 @@ def check_settings(
         raise InputError("derivative", derivative, allowed)
     if not isinstance(integrator, str) or integrator not in INTEGRATORS:
         raise InputError("integrator", integrator, "one of " + ", ".join(INTEGRATORS))
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
+        raise InputError("seed", seed, "a whole number from 0 to 2^32 - 1")
     steps_per_control = 1
     if control_period is not None:
         if clock != "sampled":

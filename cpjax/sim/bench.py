@@ -1,0 +1,134 @@
+"""A controller on a rig: it sees what the sensors measure, and its commands take effect after the drive's delay."""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int32
+
+from cpjax.checks import call, pair
+from cpjax.controllers.protocol import as_sampled
+from cpjax.errors import InputError
+from cpjax.plant.state import State
+from cpjax.pytree import Scalar, is_traced
+from cpjax.rig import Encoders, Position, Rig
+from cpjax.sim.settings import Settings
+
+_SENSORS = np.uint32(1)
+"""Second word of the noise's key; each source of noise has its own."""
+
+
+class BenchMemory(NamedTuple):
+    """Memory of a `Bench`."""
+
+    inner: Any
+    """The controller's."""
+    step: Int32[Array, ""]
+    """Number of updates so far."""
+    line: tuple[Scalar, ...]
+    """Commands that do not act yet [V], the newest first."""
+    held: Scalar | None
+    """The controller's last command [V], where it runs less often than the bench."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Bench:
+    """A controller that measures through a rig's sensors and acts through its delay.
+
+    Attributes:
+      controller: the firmware, a `Controller`.
+      sensors: what it measures by; None for the whole state.
+      seed: of the sensors' noise.
+      delay: updates until a command acts.
+      divider: updates per control period.
+      run: number of the run, which selects its noise.
+    """
+
+    controller: Any
+    sensors: Encoders | None
+    seed: Any
+    run: Any
+    delay: int
+    divider: int
+
+    def init(self, state: State) -> BenchMemory:
+        step = jnp.asarray(0, dtype=jnp.int32)
+        with _needs_rates(self.sensors):
+            inner = call("controller", as_sampled(self.controller), "init", self._measured(state, step))
+        nothing = jnp.zeros_like(jnp.asarray(state.x))
+        return BenchMemory(inner, step, (nothing,) * self.delay, nothing if self.divider > 1 else None)
+
+    def update(self, memory: BenchMemory, state: State) -> tuple[BenchMemory, Scalar]:
+        measured = self._measured(state, memory.step)
+        with _needs_rates(self.sensors):
+            returned = call("controller", as_sampled(self.controller), "update", memory.inner, measured)
+        inner, command = pair("controller.update", returned, "the new memory and the command")
+        if memory.held is not None:
+            due = memory.step % self.divider == 0
+            inner, command = jax.tree.map(
+                lambda new, old: jnp.where(due, new, old), (inner, command), (memory.inner, memory.held)
+            )
+        held = None if memory.held is None else command
+        line = (command, *memory.line)
+        return BenchMemory(inner, memory.step + 1, line[:-1], held), line[-1]
+
+    def _measured(self, state: State, step: Int32[Array, ""]) -> Any:
+        if self.sensors is None:
+            return state
+        key = (jnp.asarray(self.seed, dtype=jnp.uint32), jnp.asarray(_SENSORS))
+        return self.sensors.measure(state, key, (jnp.asarray(self.run), step.astype(jnp.uint32)))
+
+
+@contextlib.contextmanager
+def _needs_rates(sensors: Encoders | None) -> Iterator[None]:
+    """Raises an `InputError` where a controller asks for a rate that the sensors do not measure."""
+    try:
+        yield
+    except AttributeError as problem:
+        if sensors is None or not isinstance(problem.obj, Position):
+            raise
+        allowed = "one that estimates rates, as cpjax.Digital(controller, estimator): encoders measure x and theta"
+        raise InputError("controller", f"one that reads {problem.name}", allowed) from problem
+
+
+jax.tree_util.register_dataclass(
+    Bench, data_fields=["controller", "sensors", "seed", "run"], meta_fields=["delay", "divider"]
+)
+
+
+def on_bench(rig: Rig, controller: Any, settings: Settings, dt: float, seed: int, runs: Any) -> tuple[Any, Settings]:
+    """Returns the controller as the loop runs it on a rig, and the settings of that loop.
+
+    Args:
+      rig: the rig.
+      controller: the firmware.
+      settings: of the rollout as asked for.
+      dt: the integrator's step [s].
+      seed: of the sensors' noise.
+      runs: number of each run, uint32.
+
+    Raises:
+      InputError: the continuous clock with sensors or a delay, or a delay that is no whole number of steps.
+    """
+    delay = 0.0 if rig.drive is None else rig.drive.delay
+    if is_traced(delay) or np.ndim(delay):
+        raise InputError("Drive.delay", delay, "one number, known when the rollout is compiled")
+    steps = round(float(delay) / dt)
+    if abs(float(delay) / dt - steps) > 1e-6 * max(1, steps):
+        raise InputError("Drive.delay", delay, f"a whole number of steps of dt = {dt:g} s")
+    if settings.clock == "continuous":
+        if rig.sensors is not None or steps:
+            name = "sensors" if rig.sensors is not None else "drive.delay"
+            raise InputError("clock", settings.clock, f"sampled: the rig's {name} act at control instants")
+        return controller, settings
+    if rig.sensors is None and not steps:
+        return controller, settings
+    every = settings.steps_per_control
+    if steps % every == 0:
+        return Bench(controller, rig.sensors, np.uint32(seed), runs, steps // every, 1), settings
+    # A delay that ends between two control instants: the bench runs at every step.
+    return Bench(controller, rig.sensors, np.uint32(seed), runs, steps, every), settings._replace(steps_per_control=1)
