@@ -228,9 +228,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
                     if not same:
                         print(f"{name}: {kind} in {path.name} was taken", file=sys.stderr)
                 shutil.rmtree(folder)
-        rows.append(
-            {"case": name, "damages": times, **{key: counts[key] for key in ("same result", "refused", "WRONG")}}
-        )
+        rows.append({"case": name, "damages": times, **{key: counts[key] for key in OUTCOMES}})
         print(f"{name}: {dict(counts)}", file=sys.stderr)
     print_table(
         "Damages", ("case", "damages", *OUTCOMES), [tuple(str(value) for value in row.values()) for row in rows], 1

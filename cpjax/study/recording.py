@@ -26,7 +26,7 @@ SUFFIXES = (".parquet", ".npz", ".json")
 """Suffixes of the files that a sweep's metrics can be written to."""
 
 _DOCUMENT = b"cpjax"  # key of the document in a Parquet file
-_DIGEST = "digest"  # key of the checksum in a document on disk
+_DIGEST, _LAYOUT = "digest", "layout"  # keys of the checksum, and of the layout that has one, in a document on disk
 
 
 def record_sweep(
@@ -136,22 +136,38 @@ def read_sweep(path: str | Path) -> tuple[dict[str, Any], dict[str, Shaped[np.nd
     try:
         if path.suffix == ".json":
             table = files.read_table(path)
-            document, found = dict(table["document"]), files.dump_json(table["columns"])
+            document = _unsealed(table["document"], files.dump_json(table["columns"]))
             columns = {name: np.asarray(values) for name, values in table["columns"].items()}
-            expected, actual = document.pop(_DIGEST, None), hashlib.sha256(found.encode()).hexdigest()
         else:
             table = _pyarrow().parquet.read_table(path, page_checksum_verification=True)
-            document = files.parse_json(table.schema.metadata[_DOCUMENT].decode())
             columns = {name: _column(table[name]) for name in table.column_names}
-            expected, actual = document.pop(_DIGEST, None), archive.digest(columns)
-        # Files of cpjax 0.1 have no checksum.
-        if expected not in (None, actual):
-            raise ValueError("its content was changed")
+            document = files.parse_json(table.schema.metadata[_DOCUMENT].decode())
+            document = _unsealed(document, archive.digest(columns))
     except Exception as problem:  # pyarrow raises nearly anything for a damaged file
         if isinstance(problem, InputError):
             raise
         raise InputError("path", str(path), f"a file written by record_sweep ({problem})") from problem
     return document, columns
+
+
+def _sealed(document: dict[str, Any], content: str) -> dict[str, Any]:
+    """Returns a document with a checksum of itself and of `content`."""
+    digest = hashlib.sha256(f"{files.dump_json(document)} {content}".encode()).hexdigest()
+    return {**document, _LAYOUT: 2, _DIGEST: digest}
+
+
+def _unsealed(sealed: dict[str, Any], content: str) -> dict[str, Any]:
+    """Returns the document without its checksum.
+
+    Raises:
+      ValueError: document or content have changed.
+    """
+    document = {key: value for key, value in sealed.items() if key not in (_DIGEST, _LAYOUT)}
+    # Files of cpjax 0.1 have neither key; one without the other is damaged.
+    given, expected = ([seal.get(key) for key in (_DIGEST, _LAYOUT)] for seal in (sealed, _sealed(document, content)))
+    if given not in ([None, None], expected):
+        raise ValueError("its content was changed")
+    return document
 
 
 def _column(column: Any) -> Shaped[np.ndarray, "starts ..."]:
@@ -215,15 +231,15 @@ def _assemble(path: Path, blocks: list[archive.Arrays], document: dict[str, Any]
     results = {name: np.concatenate([one[name] for one in blocks]) for name in blocks[0]}
     columns = {**_starts(work, 0, work.total), **results}
     if path.suffix == ".json":
-        digest = hashlib.sha256(files.dump_json(columns).encode()).hexdigest()
-        files.write_json(path, {"document": {**document, _DIGEST: digest}, "columns": columns})
+        document = files.parse_json(files.dump_json(document))
+        files.write_json(path, {"document": _sealed(document, files.dump_json(columns)), "columns": columns})
     elif path.suffix == ".npz":
         archive.write_archive(path, columns, document)
     else:
         arrow = _pyarrow()
         table = arrow.table({name: column if column.ndim == 1 else column.tolist() for name, column in columns.items()})
-        digest = archive.digest({name: _column(table[name]) for name in columns})
-        table = table.replace_schema_metadata({_DOCUMENT: files.dump_json({**document, _DIGEST: digest})})
+        sealed = _sealed(document, archive.digest({name: _column(table[name]) for name in columns}))
+        table = table.replace_schema_metadata({_DOCUMENT: files.dump_json(sealed)})
         buffer = buffers.BytesIO()
         arrow.parquet.write_table(table, buffer, write_page_checksum=True)
         files.write_bytes(path, buffer.getvalue())

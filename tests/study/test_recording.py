@@ -212,3 +212,18 @@ def test_a_controller_of_ones_own_is_recorded_and_its_choices_tell_two_sweeps_ap
     found = cpjax.record_sweep(path, PLANT, dead_time.example()[0], starts, **settings)
     assert found.effort.shape == (64,)
     assert cpjax.read_sweep(path)[0]["controller"] == "DeadTime"
+
+
+def test_a_changed_description_of_a_result_is_refused(tmp_path):
+    path = tmp_path / "runs.json"
+    starts = cpjax.sample_starts("hanging", 3, seed=1)
+    law = paper.controller("corrected-centred", "placement", PLANT)
+    record_sweep(path, PLANT, law, starts, duration=0.02, dt=0.01)
+    whole = path.read_bytes()
+    for old, new in ((b'"count": 3', b'"count": 4'), (b'"digest"', b'"digesu"'), (b'"layout"', b'"layouu"')):
+        assert whole.count(old) >= 1
+        path.write_bytes(whole.replace(old, new))
+        with pytest.raises(InputError):
+            read_sweep(path)
+    path.write_bytes(whole)
+    assert read_sweep(path)[0]["count"] == 3
