@@ -128,7 +128,7 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) ->
     correction = jnp.where(far, 0.0, correction)
     corrected = step + correction
 
-    # What follows only searches for the crossing: Newton's corrections carry its derivative, and a step that is tried has
+    # What follows only searches for the crossing: Newton's corrections carry its derivative, steps that are tried have
     # none (`stop_gradient`).
     # The first guard to fall, if any. The one whose crossing is being located is about zero, of either sign; another
     # one that falls at the same time is located afterwards.
