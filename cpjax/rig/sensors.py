@@ -3,12 +3,13 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from cpjax.numeric.noise import Word, standard_normals
 from cpjax.numeric.quantisation import quantize
 from cpjax.plant.state import State
-from cpjax.pytree import Scalar, number, pytree
+from cpjax.pytree import Scalar, is_traced, number, pytree
 
 
 class Position(NamedTuple):
@@ -35,18 +36,26 @@ class Encoders:
     )
     theta_offset: Scalar = number("rad", "error of the angle's zero, added before rounding", default=0.0)
 
-    def measure(self, state: State, key: tuple[Word, Word], counter: tuple[Word, Word]) -> Position:
+    @property
+    def noisy(self) -> bool:
+        """Whether the noise is not known to be zero."""
+        return any(is_traced(noise) or bool(np.any(np.asarray(noise))) for noise in (self.x_noise, self.theta_noise))
+
+    def measure(
+        self, state: State, key: tuple[Word, Word], counter: tuple[Word, Word], *, noisy: bool = True
+    ) -> Position:
         """Returns the measurement of a state.
 
         Args:
           state: the plant's state.
           key: of the noise.
           counter: numbers of the run and of the control instant, which select the noise.
+          noisy: whether noise is drawn at all.
         """
-        dtype = jnp.asarray(state.x).dtype
-        of_x, of_theta = standard_normals(key, counter, dtype)
-        x = state.x + self.x_noise * of_x
-        theta = state.theta + self.theta_offset + self.theta_noise * of_theta
+        x, theta = state.x, state.theta + self.theta_offset
+        if noisy:
+            of_x, of_theta = standard_normals(key, counter, jnp.asarray(state.x).dtype)
+            x, theta = x + self.x_noise * of_x, theta + self.theta_noise * of_theta
         return Position(
             quantize(x, self.x_step, derivative="straight_through"),
             quantize(theta, self.theta_step, derivative="straight_through"),

@@ -46,6 +46,7 @@ class Bench:
       delay: updates until a command acts.
       divider: updates per control period.
       run: number of the run, which selects its noise.
+      noisy: whether the sensors have noise.
     """
 
     controller: Any
@@ -54,6 +55,7 @@ class Bench:
     run: Any
     delay: int
     divider: int
+    noisy: bool
 
     def init(self, state: State) -> BenchMemory:
         step = jnp.asarray(0, dtype=jnp.int32)
@@ -80,7 +82,7 @@ class Bench:
         if self.sensors is None:
             return state
         key = (jnp.asarray(self.seed, dtype=jnp.uint32), jnp.asarray(_SENSORS))
-        return self.sensors.measure(state, key, (jnp.asarray(self.run), step.astype(jnp.uint32)))
+        return self.sensors.measure(state, key, (jnp.asarray(self.run), step.astype(jnp.uint32)), noisy=self.noisy)
 
 
 @contextlib.contextmanager
@@ -96,7 +98,7 @@ def _needs_rates(sensors: Encoders | None) -> Iterator[None]:
 
 
 jax.tree_util.register_dataclass(
-    Bench, data_fields=["controller", "sensors", "seed", "run"], meta_fields=["delay", "divider"]
+    Bench, data_fields=["controller", "sensors", "seed", "run"], meta_fields=["delay", "divider", "noisy"]
 )
 
 
@@ -127,8 +129,9 @@ def on_bench(rig: Rig, controller: Any, settings: Settings, dt: float, seed: int
         return controller, settings
     if rig.sensors is None and not steps:
         return controller, settings
-    every = settings.steps_per_control
+    every, noisy = settings.steps_per_control, rig.sensors is not None and rig.sensors.noisy
     if steps % every == 0:
-        return Bench(controller, rig.sensors, np.uint32(seed), runs, steps // every, 1), settings
+        return Bench(controller, rig.sensors, np.uint32(seed), runs, steps // every, 1, noisy), settings
     # A delay that ends between two control instants: the bench runs at every step.
-    return Bench(controller, rig.sensors, np.uint32(seed), runs, steps, every), settings._replace(steps_per_control=1)
+    bench = Bench(controller, rig.sensors, np.uint32(seed), runs, steps, every, noisy)
+    return bench, settings._replace(steps_per_control=1)
