@@ -295,7 +295,7 @@ def renamed(**names: str) -> Callable[[type[T]], type[T]]:
                 given[names[old]] = given.pop(old)
             make(self, *values, **given)
 
-        cls.__init__ = init  # type: ignore[method-assign]  # wrapped on purpose
+        cls.__init__ = init  # type: ignore[method-assign]  # mypy allows no new one; it takes old names
         cls.RENAMED = names  # type: ignore[attr-defined]  # mypy does not see attributes added to a class
         return cls
 

@@ -31,5 +31,6 @@ def quantize(value: Scalars, step: Scalar, *, derivative: QuantiserDerivative) -
     if derivative not in ("zero", "straight_through"):
         raise InputError("derivative", derivative, "zero or straight_through")
     value, step = jnp.asarray(value), jnp.asarray(step)
+    # Rounding has no derivative of use; the one that is asked for is added below.
     result = step * lax.round(lax.stop_gradient(value / step), lax.RoundingMethod.TO_NEAREST_EVEN)
     return result + (value - lax.stop_gradient(value)) if derivative == "straight_through" else result

@@ -33,6 +33,7 @@ def crossing_fraction(start: Scalar, start_slope: Scalar, end: Scalar, end_slope
     Returns:
       The fraction [1].
     """
+    # Only a guess: `newton_correction` supplies the root's derivative.
     start, start_slope, end, end_slope = (lax.stop_gradient(x) for x in (start, start_slope, end, end_slope))
     rise = end - start
     third = start_slope + end_slope - 2.0 * rise
@@ -67,5 +68,6 @@ def newton_correction(value: Scalar, slope: Scalar, steepness: Scalar) -> Float[
       The step [unit of time].
     """
     value = jnp.asarray(value)
+    # The slope's derivative would be multiplied by a value that is almost zero; the scale changes no result.
     least = 1e-6 * lax.stop_gradient(steepness) + float(np.finfo(value.dtype).tiny) ** 0.25
     return -value / jnp.minimum(lax.stop_gradient(slope), -least)

@@ -1,6 +1,6 @@
 """Confidence intervals and significance tests of success rates.
 
-Closed forms, because importing scipy.stats takes half as long as importing cpjax; the tests compare with it.
+Closed forms, because importing scipy.stats is slow; the tests compare with it.
 """
 
 import math

@@ -7,10 +7,8 @@ from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.pytree import Scalar, part, pytree
 from cpjax.rig.drive import Drive
-from cpjax.rig.sensors import Encoders, Position
+from cpjax.rig.sensors import Encoders
 from cpjax.rig.track import Track
-
-__all__ = ["OnTheBench", "Position", "Rig"]
 
 
 @pytree

@@ -193,6 +193,7 @@ def observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, 
     """Returns the system's observation, and the rates of change of its guards and of the floating-point leaves of its
     output, which are not differentiable."""
     current = system.observe(q, v, mode)
+    # Rates of change only guide the search and scale corrections, which are zero to rounding.
     rates = lax.stop_gradient((v, current.acceleration))
 
     def changing(q: Tree, v: Tree) -> tuple[Guards, list[Float[Array, "..."]]]:
