@@ -54,6 +54,7 @@ class Number:
       change: where its value is zero, the change that audits of gradients take as its scale; `typical` if not declared.
       neutral: value at which the plant moves as if it had no such parameter. A bridge that cannot express the
         parameter refuses any other value.
+      optional: whether the value may be None: the component has no such part, which then costs nothing.
     """
 
     unit: str
@@ -69,6 +70,7 @@ class Number:
     drawn: Size | None = None
     change: Size | None = None
     neutral: float = 0.0
+    optional: bool = False
 
     def size(self, owner: Any, use: Literal["typical", "drawn", "change"] = "typical") -> float:
         """Returns the scale of the parameter where its value is zero, in the parameter's unit.
@@ -98,6 +100,8 @@ class Number:
         return " ".join([kind, " and ".join(e for e in ends if e), f"[{self.unit}]"]).replace("  ", " ")
 
     def normalise(self, name: str, value: Any) -> Any:
+        if value is None and self.optional:
+            return None
         if isinstance(value, np.generic):
             value = value.item()
         if isinstance(value, int) and not isinstance(value, bool):
@@ -311,6 +315,11 @@ def numbers(*classes: type) -> dict[str, Number]:
     """Returns the declared numbers of `pytree` classes, by field name, in order; other classes contribute none."""
     known = [cls for cls in classes if dataclasses.is_dataclass(cls)]
     return {name: rule for cls in known for name, rule in rules(cls).items() if isinstance(rule, Number)}
+
+
+def present(component: Any) -> dict[str, Number]:
+    """Returns the declared numbers that a component has, by field name: without those that are None."""
+    return {name: rule for name, rule in numbers(type(component)).items() if getattr(component, name) is not None}
 
 
 @functools.cache

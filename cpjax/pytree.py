@@ -29,6 +29,7 @@ from cpjax.fields import (
     number,
     numbers,
     part,
+    present,
     rules,
 )
 
@@ -50,6 +51,7 @@ __all__ = [
     "number",
     "numbers",
     "part",
+    "present",
     "pytree",
     "reveal",
     "rules",
@@ -161,6 +163,8 @@ def _check_fields(name: str, tree: Any, batch: int | None) -> list[bool]:
         path, value, rule = f"{name}.{field.name}", getattr(tree, field.name), declared.get(field.name)
         if is_component(value):
             batched += _check_fields(path, value, batch)
+        elif value is None and isinstance(rule, Number) and rule.optional:
+            continue
         elif isinstance(rule, (Number, Matrix)) or (field.name in scalars and is_number(value)):
             expected = rule.shape if isinstance(rule, Matrix) else ()
             shape = () if isinstance(value, float) else np.shape(value)

@@ -394,8 +394,10 @@ def test_on_the_continuous_clock_the_walls_stand_beside_clip_and_gate():
     assert int(fine.flag) == 0
     assert np.max(np.abs(np.asarray(fine.state.x))) <= 0.35 + 1e-12
     assert np.max(np.abs(columns(fine.state) - columns(coarse.state))) <= 1e-6
-    with pytest.raises(cpjax.InputError, match=r"switching = 'per_step': must be located, or absent, for a plant with"):
-        cpjax.rollout(walls, controller, cpjax.HANGING, duration=0.1, dt=0.002, switching="per_step")
+    with pytest.raises(cpjax.InputError, match=r"must be located, or absent, for a plant with"):
+        cpjax.rollout(
+            walls, controller, cpjax.HANGING, duration=0.1, dt=0.002, clock="continuous", switching="per_step"
+        )
 
 
 # --- random keys ------------------------------------------------------------------------------------------------------

@@ -55,6 +55,7 @@ def calls():
     from cpjax.linear.structure import Structure
     from cpjax.numeric.double_word import DoubleWord
     from cpjax.plant import CartPole, ForceActuator, LumpedMotor, Motor, State
+    from cpjax.plant.contact import ContactMode, in_contact
 
     # Five states and two inputs, so that no two axes of a matrix are equally long by chance.
     A = jnp.diag(-jnp.arange(1.0, 6.0)) + jnp.diag(jnp.full(4, 0.3), 1)
@@ -66,6 +67,10 @@ def calls():
     wide, word = DoubleWord(batch, 0.0 * batch), DoubleWord(b, 0.0 * b)
     plant, motor, state = CartPole(), Motor(), State(0.1, 0.2, 0.3, 0.4)
     mode, period = jnp.asarray(0, dtype=jnp.int32), 0.01
+    touching, contact = (
+        in_contact(CartPole(coulomb_friction=1.0, pivot_coulomb_friction=0.1), 0.4),
+        ContactMode(mode, mode),
+    )
     weights, pair = c.LqrWeights(np.eye(4), 1.0), c.PoleFactors(np.ones(2), np.ones(2))
     law, swing_up = c.StateFeedback(np.ones((1, 4)), design=weights), c.EnergySwingUp(plant, 2.0)
     gate = c.AngleGate(0.3)
@@ -180,7 +185,23 @@ def calls():
         "plant.cartpole.CartPole.moving_mass": call(plant),
         "plant.cartpole.CartPole.pivot_inertia": call(plant),
         "plant.cartpole.CartPole.acceleration": call(plant, 0.6, 0.8, (0.1, 0.2), 1.0),
+        "plant.cartpole.CartPole.solved": call(plant, 0.6, 0.8, 0.1, 0.2),
         "plant.cartpole.CartPole.vector_field": call(plant, state, 1.0),
+        "plant.contact.in_contact": call(plant, 0.4, 0.5),
+        "plant.contact.InContact.limits": call(touching),
+        "plant.contact.InContact.input_limit": call(touching),
+        "plant.contact.InContact.units": call(touching),
+        "plant.contact.InContact.coordinates": call(touching, state),
+        "plant.contact.InContact.state": call(touching, (0.1, 0.2), (0.3, 0.4)),
+        "plant.contact.InContact.saturate": call(touching, 20.0),
+        "plant.contact.InContact.geometry": call(touching, (0.1, 0.2)),
+        "plant.contact.InContact.geometry_near": call(touching, (0.6, 0.8), (0.01, 0.01)),
+        "plant.contact.InContact.accelerations": call(touching, (0.6, 0.8), (0.1, 0.2), 1.0, contact),
+        "plant.contact.InContact.outputs": call(touching, state, (0.1, 0.2), 1.0),
+        "plant.contact.InContact.start_mode": call(touching, (0.1, 0.2), (0.3, 0.4)),
+        "plant.contact.InContact.guards": call(touching, (0.1, 0.2), (0.3, 0.4), 1.0, contact),
+        "plant.contact.InContact.jump": call(touching, (0.1, 0.2), (0.3, 0.4), contact, jnp.asarray(0, jnp.int32)),
+        "plant.contact.InContact.release": call(touching, (0.1, 0.2), (0.3, 0.4), 1.0, contact),
         "plant.cartpole.CartPole.force_for_acceleration": call(plant, state, 1.0),
         "plant.cartpole.CartPole.kinetic_energy": call(plant, state),
         "plant.cartpole.CartPole.potential_energy": call(plant, state),

@@ -1,5 +1,6 @@
 """Argument checks of the bridges: numbers must be concrete, because JAX cannot trace through other packages."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -7,7 +8,7 @@ import numpy as np
 
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
-from cpjax.pytree import Number, check, is_traced, numbers
+from cpjax.pytree import Number, check, is_traced, present
 
 EXPRESSED = (
     *("cart_mass", "pole_mass", "pole_length", "gravity", "pole_inertia", "cart_friction", "pivot_friction"),
@@ -33,7 +34,7 @@ def concrete_plant(plant: Any) -> CartPole:
 
 def unexpressed(part: Any) -> dict[str, Number]:
     """Returns the non-neutral numbers of a plant or motor beyond `EXPRESSED`: no formula of a bridge contains them."""
-    declared = numbers(type(part)).items()
+    declared = (present(part) if dataclasses.is_dataclass(part) else {}).items()
     return {name: rule for name, rule in declared if name not in EXPRESSED and getattr(part, name) != rule.neutral}
 
 

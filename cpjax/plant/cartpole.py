@@ -77,9 +77,24 @@ class CartPole:
         drawn=_fifth_of_critical_damping,
         change=0.01,
     )
+    coulomb_friction: Scalars | None = number(
+        "N", "dry friction of the cart, F_c", default=None, at_least=0.0, linear=False, optional=True, change=0.1
+    )
+    pivot_coulomb_friction: Scalars | None = number(
+        "N m", "dry friction of the pivot", default=None, at_least=0.0, linear=False, optional=True, change=0.001
+    )
+    static_friction_ratio: Scalars = number(
+        "1", "static per sliding dry friction", default=1.0, at_least=1.0, linear=False, neutral=1.0
+    )
     motor: Any = part(
         "a cpjax.Motor, LumpedMotor or ForceActuator", "saturate", "force", "reflected_mass", default_factory=Motor
     )
+
+    def __post_init__(self) -> None:
+        for name in ("coulomb_friction", "pivot_coulomb_friction"):
+            value = getattr(self, name)
+            if isinstance(value, float) and value == 0.0:  # no dry friction, which costs nothing
+                object.__setattr__(self, name, None)
 
     @classmethod
     def rod(cls, *, mass: Scalars, length: Scalars, **others: Any) -> "CartPole":
@@ -175,10 +190,22 @@ class CartPole:
           force: horizontal force of the wheels on the cart [N].
         """
         x_dot, theta_dot = rates
-        m, inertia = self.pole_mass, self.pivot_inertia
-        ml = m * self.pole_length
+        ml = self.pole_mass * self.pole_length
         push = force - self.cart_friction * x_dot - ml * theta_dot * theta_dot * sin
         torque = ml * self.gravity * sin - self.pivot_friction * theta_dot
+        return self.solved(sin, cos, push, torque)
+
+    def solved(self, sin: Scalars, cos: Scalars, push: Scalars, torque: Scalars) -> tuple[Scalars, Scalars]:
+        """Solves the equations of motion for `(x'', theta'')` [m/s^2, rad/s^2].
+
+        Args:
+          sin: sine of theta.
+          cos: cosine of theta.
+          push: right-hand side of the cart's equation, but for the pole's acceleration [N].
+          torque: right-hand side of the pole's, but for the cart's acceleration [N m].
+        """
+        m, inertia = self.pole_mass, self.pivot_inertia
+        ml = m * self.pole_length
         # (M + m)(J + m l^2) - (m l cos)^2, written as a sum of positive terms so that nothing cancels
         determinant = (self.moving_mass + m) * self.pole_inertia + ml * self.pole_length * (
             self.moving_mass + m * sin * sin

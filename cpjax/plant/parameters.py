@@ -6,12 +6,12 @@ from typing import Any
 
 from cpjax.errors import InputError
 from cpjax.plant.cartpole import CartPole
-from cpjax.pytree import Number, Scalars, numbers
+from cpjax.pytree import Number, Scalars, numbers, present
 
 
 def parameters_of(plant: CartPole) -> dict[str, Number]:
-    """Returns the declarations of the plant's and the motor's numbers by name, in order."""
-    return numbers(type(plant), type(plant.motor))
+    """Returns the declarations of the numbers that the plant and its motor have, by name, in order."""
+    return present(plant) | (present(plant.motor) if dataclasses.is_dataclass(plant.motor) else {})
 
 
 def parameter(plant: CartPole, name: str) -> Scalars:

@@ -58,12 +58,16 @@ def differences(one: CartPole, other: CartPole) -> dict[str, tuple[Any, Any]]:
     """Returns both values of each number of CartPole and Motor that differs by more than a rounding to float32."""
     pairs = [(cls, a, b) for cls, a, b in ((CartPole, one, other), (Motor, one.motor, other.motor))]
     values = {
-        name: (getattr(a, name), getattr(b, name))
+        name: (_known(getattr(a, name), rule), _known(getattr(b, name), rule))
         for cls, a, b in pairs
         for name, rule in rules(cls).items()
         if isinstance(rule, Number)
     }
     return {name: two for name, two in values.items() if not np.allclose(*two, rtol=1e-6, atol=0.0)}
+
+
+def _known(value: Any, rule: Number) -> Any:
+    return rule.neutral if value is None else value
 
 
 def _text(value: Any) -> str:

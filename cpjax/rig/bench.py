@@ -5,6 +5,7 @@ from typing import Any
 
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
+from cpjax.plant.contact import InContact, in_contact
 from cpjax.pytree import Scalar, part, pytree
 from cpjax.rig.drive import Drive
 from cpjax.rig.sensors import Encoders
@@ -32,16 +33,21 @@ class Rig:
     @property
     def dynamics(self) -> Any:
         """The plant as the loop sees it, with the drive's dead band and the track's ends."""
-        if self.drive is None and self.track is None:
-            return self.plant
-        return OnTheBench(self.plant, Drive() if self.drive is None else self.drive, self.track)
+        track = self.track
+        if track is not None and track.ends == "stop":
+            plant, track = in_contact(self.plant, track.half_length, track.restitution), None
+        else:
+            plant = in_contact(self.plant)
+        if self.drive is None and track is None:
+            return plant
+        return OnTheBench(plant, Drive() if self.drive is None else self.drive, track)
 
 
 @pytree
 class OnTheBench:
-    """A cart-pole with its drive and track, for the loop."""
+    """A cart-pole with its drive and track, for the loop; with dry friction it also has the plant's modes."""
 
-    plant: CartPole = part("a cpjax.CartPole", "accelerations", "saturate")
+    plant: CartPole | InContact = part("a cpjax.CartPole", "accelerations", "saturate")
     drive: Drive = part("a cpjax.Drive", "apply")
     track: Track | None = None
 
@@ -66,8 +72,8 @@ class OnTheBench:
     def geometry_near(self, geometry: Any, change: Any) -> Any:
         return self.plant.geometry_near(geometry, change)
 
-    def accelerations(self, geometry: Any, v: Any, u: Scalar) -> Any:
-        return self.plant.accelerations(geometry, v, u)
+    def accelerations(self, geometry: Any, v: Any, u: Scalar, *mode: Any) -> Any:
+        return self.plant.accelerations(geometry, v, u, *mode)
 
     def outputs(self, state: Any, acceleration: Any, u: Scalar) -> Any:
         return self.plant.outputs(state, acceleration, u)

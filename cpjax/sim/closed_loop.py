@@ -13,11 +13,10 @@ from jaxtyping import Array, Float, Int
 from cpjax.backend.single_kernel import outline
 from cpjax.checks import call, integer, real
 from cpjax.controllers.protocol import SmoothController, demand
-from cpjax.errors import InputError
 from cpjax.sim import plants
 from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.stepper import dtype_of
-from cpjax.sim.switching import Guards, Observation
+from cpjax.sim.switching import Observation
 
 UPPER, LOWER, GATE = 0, 1, 2
 """Indices of the guards on the continuous clock: the two voltage limits and the controller's margin."""
@@ -59,7 +58,7 @@ class ContinuousLoop(NamedTuple):
             jnp.where(mode.clip > 0, relative - 1.0, 1.0 - relative),
             jnp.where(mode.clip < 0, -1.0 - relative, 1.0 + relative),
             margin.astype(dtype_of(state)),
-            *plant_guards(self.plant, q, v, u, mode.plant),
+            *plants.guards(self.plant, q, v, u, mode.plant),
         )
         return Observation(plant_accelerations(self.plant, q, v, u, mode.plant), guards, u)
 
@@ -76,22 +75,33 @@ class ContinuousLoop(NamedTuple):
         if not plants.has_events(self.plant):
             return q, v, Mode(law, clip, mode.plant)
         own = guard > GATE
-        after_q, after_v, after = plant_jump(self.plant, q, v, mode.plant, guard - (GATE + 1))
+        before = self._applied(state, mode.law, mode.clip)
+        after_q, after_v, after = plants.jump(self.plant, q, v, before, mode.plant, guard - (GATE + 1))
         q, v, of_plant = jax.tree.map(
             lambda new, old: jnp.where(own, new, old), (after_q, after_v, after), (q, v, mode.plant)
         )
-        # A jump of the plant's state may move the demand beyond a limit.
-        clip = jnp.where(own, self._clip(plants.state_of(self.plant, q, v), law).astype(clip.dtype), clip)
+        # A jump of the plant's state may move the demand beyond a limit, and one of the demand may release the plant.
+        state = plants.state_of(self.plant, q, v)
+        clip = jnp.where(own, self._clip(state, law).astype(clip.dtype), clip)
+        of_plant = plants.release(self.plant, q, v, self._applied(state, law, clip), of_plant)
         return q, v, Mode(law, clip, of_plant)
 
     def start_mode(self, start: Tree) -> Mode:
         """Returns the mode at the start of a rollout."""
         law = integer("controller.start_mode", call("controller", self.controller, "start_mode", start))
-        return Mode(law, self._clip(start, law), plants.start_mode(self.plant, *plants.coordinates(self.plant, start)))
+        clip = self._clip(start, law)
+        q, v = plants.coordinates(self.plant, start)
+        of_plant = plants.start_mode(self.plant, q, v)
+        return Mode(law, clip, plants.release(self.plant, q, v, self._applied(start, law, clip), of_plant))
 
     def _clip(self, state: Tree, law: Int[Array, ""]) -> Int[Array, ""]:
         demanded, limit = self._demand(state, law), self.plant.input_limit
         return (demanded > limit).astype(jnp.int32) - (demanded < -limit).astype(jnp.int32)
+
+    def _applied(self, state: Tree, law: Int[Array, ""], clip: Int[Array, ""]) -> Float[Array, ""]:
+        """Returns the applied voltage, with the demand clipped as `clip` says."""
+        limit = self.plant.input_limit
+        return jnp.where(clip == 0, self._demand(state, law), jnp.where(clip > 0, limit, -limit))
 
     def _demand(self, state: Tree, law: Int[Array, ""]) -> Float[Array, ""]:
         return demand(self.controller, state, law)
@@ -112,11 +122,11 @@ class HeldLoop(NamedTuple):
     plant: Plant
 
     def observe(self, q: Tree, v: Tree, mode: HeldMode) -> Observation:
-        guards = plant_guards(self.plant, q, v, mode.u, mode.plant)
+        guards = plants.guards(self.plant, q, v, mode.u, mode.plant)
         return Observation(plant_accelerations(self.plant, q, v, mode.u, mode.plant), guards, mode.u)
 
     def jump(self, q: Tree, v: Tree, mode: HeldMode, guard: Int[Array, ""]) -> tuple[Tree, Tree, HeldMode]:
-        q, v, of_plant = plant_jump(self.plant, q, v, mode.plant, guard)
+        q, v, of_plant = plants.jump(self.plant, q, v, mode.u, mode.plant, guard)
         return q, v, mode._replace(plant=of_plant)
 
 
@@ -127,32 +137,3 @@ def plant_accelerations(plant: Plant, q: Tree, v: Tree, u: Float[Array, ""], mod
     """Returns the accelerations q'' under the input `u`, in the plant's own mode."""
     geometry = plants.geometry(plant, q)
     return outline(plants.accelerations)(plant, geometry, v, u, mode)
-
-
-def plant_guards(plant: Plant, q: Tree, v: Tree, u: Float[Array, ""], mode: Tree) -> Guards:
-    """Returns the plant's own guards, () for a plant without events.
-
-    Raises:
-      InputError: the plant's `guards` returns no tuple of scalars.
-    """
-    if not plants.has_events(plant):
-        return ()
-    guards = call("plant", plant, "guards", q, v, u, mode)
-    if not isinstance(guards, tuple):
-        raise InputError("plant.guards", f"a {type(guards).__name__}", "a tuple of scalars")
-    return tuple(real(f"plant.guards[{i}]", guard, u.dtype) for i, guard in enumerate(guards))
-
-
-def plant_jump(plant: Any, q: Tree, v: Tree, mode: Tree, guard: Int[Array, ""]) -> tuple[Tree, Tree, Tree]:
-    """Returns positions, velocities and the plant's mode after its own guard of this number (int32) has fallen.
-
-    Raises:
-      InputError: the plant's `jump` returns another tree structure.
-    """
-    after = call("plant", plant, "jump", q, v, mode, guard)
-    found: Any = jax.tree.structure(after)
-    if found != jax.tree.structure((q, v, mode)):
-        raise InputError("plant.jump", str(found), "positions, velocities and mode, as given")
-    cast = lambda new, old: jnp.asarray(new, dtype=jnp.asarray(old).dtype)  # noqa: E731
-    jumped: tuple[Tree, Tree, Tree] = jax.tree.map(cast, after, (q, v, mode))
-    return jumped

@@ -64,7 +64,7 @@ def simulate(
         system = HeldLoop(plant)
         control = start_control(plant, controller, start, settings)
         control = update_control(plant, controller, control, start, settings)
-        mode = HeldMode(control.applied, plants.start_mode(plant, q, v))
+        mode = HeldMode(control.applied, plants.release(plant, q, v, control.applied, plants.start_mode(plant, q, v)))
     motion = start_motion(system, q, v, mode, dt)
     loop = _Loop(motion, flag, motion.current.output, _law(motion, control), control, jnp.zeros_like(flag))
     first = _sample(plant, loop, motion, dt)
@@ -184,7 +184,8 @@ def _control(
     state = plants.state_of(plant, motion.q, motion.v)
     control = update_control(plant, controller, loop.control, state, settings)
     changes = jnp.where(control.mode != loop.control.mode, loop.changes + 1, 0)
-    mode = motion.mode._replace(u=control.applied)
+    released = plants.release(plant, motion.q, motion.v, control.applied, motion.mode.plant)
+    mode = motion.mode._replace(u=control.applied, plant=released)
     current, slopes, _ = observe(system, motion.q, motion.v, mode)
     new = (control, changes, motion._replace(mode=mode, current=current, slopes=slopes))
     control, changes, motion = jax.tree.map(

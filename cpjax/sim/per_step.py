@@ -22,7 +22,8 @@ from cpjax.sim import failures, plants
 from cpjax.sim.control import Control, start_control, update_control
 from cpjax.sim.derivatives import shifted, warn_of_memory
 from cpjax.sim.flags import CHATTER_LENGTH, NEEDS_RECOMPUTE, Flag, nonfinite_flag, nonfinite_input
-from cpjax.sim.integrators import INTEGRATORS, Step
+from cpjax.sim.in_step import step_with_event
+from cpjax.sim.integrators import INTEGRATORS, Integrator, Step
 from cpjax.sim.metrics import Metric, MetricState, Sample, finalize_name
 from cpjax.sim.plants import Plant, PlantState, Tree
 from cpjax.sim.saved import pack
@@ -46,6 +47,8 @@ class _Loop(NamedTuple):
     flag: Int[Array, ""]
     changes: Int[Array, ""]
     """Number of consecutive control instants at which the mode changed."""
+    plant_mode: Tree = ()
+    """The plant's own mode; () for a plant without events."""
 
 
 _Carry: TypeAlias = tuple[_Loop, MetricState]
@@ -58,7 +61,8 @@ def simulate(
     control = start_control(plant, controller, start, settings)
     flag = nonfinite_flag((start, plant, controller))
     flag = jnp.where(flag != 0, np.int32(NEEDS_RECOMPUTE), flag) if settings.fast_path else flag
-    loop = _Loop(start, control, flag, jnp.zeros_like(flag))
+    plant_mode = plants.start_mode(plant, *plants.coordinates(plant, start))
+    loop = _Loop(start, control, flag, jnp.zeros_like(flag), plant_mode)
     _, first, _ = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
 
     started = start_metric(metric, first)
@@ -155,7 +159,7 @@ def sees_the_voltage(metric: Metric, memory: MetricState, sample: Sample) -> boo
 def _completed(plant: Plant, sample: Sample) -> Sample:
     """Returns a sample whose voltage has been replaced, with its outputs recomputed."""
     q, v = plants.coordinates(plant, sample.state)
-    acceleration = plants.accelerations(plant, plants.geometry(plant, q), v, sample.voltage)
+    acceleration = plants.accelerations(plant, plants.geometry(plant, q), v, sample.voltage, sample.plant_mode)
     return sample._replace(outputs=plants.outputs(plant, sample.state, acceleration, sample.voltage))
 
 
@@ -202,7 +206,8 @@ def _observe(
     going = jnp.asarray(True) if settings.fast_path else ~failures.is_stopped(flag)
     q, v = plants.coordinates(plant, state)
     geometry = plants.geometry(plant, q)
-    accelerations = outline(plants.accelerations)(plant, geometry, v, voltage)
+    plant_mode = plants.release(plant, q, v, control.applied, loop.plant_mode)
+    accelerations = outline(plants.accelerations)(plant, geometry, v, voltage, plant_mode)
     sample = Sample(
         time=index.astype(dt.dtype) * dt,
         elapsed=jnp.where((index > 0) & going, dt, 0.0),
@@ -213,14 +218,14 @@ def _observe(
         mode=mode,
         mode_before=before,
         outputs=plants.outputs(plant, state, accelerations, voltage),
-        plant_mode=(),
+        plant_mode=plant_mode,
         flag=flag,
         crossing=jnp.zeros_like(mode),
         crossing_speed=jnp.zeros_like(voltage),
     )
     if control.blend is not None:
-        accelerations = outline(plants.accelerations)(plant, geometry, v, control.applied)
-    return _Loop(state, control, flag, changes), sample, _Instant(accelerations, geometry)
+        accelerations = outline(plants.accelerations)(plant, geometry, v, control.applied, plant_mode)
+    return _Loop(state, control, flag, changes, plant_mode), sample, _Instant(accelerations, geometry)
 
 
 def _advance(plant: Plant, controller: Any, loop: _Loop, instant: _Instant, dt: Step, settings: Settings) -> _Loop:
@@ -229,17 +234,37 @@ def _advance(plant: Plant, controller: Any, loop: _Loop, instant: _Instant, dt: 
     first, geometry = instant
     outlook = failures.look_ahead(plant, plants.coordinates(plant, state)[1], first, dt)
     if settings.fast_path:  # values only: no guarded derivatives, and failed runs are recomputed
-        after, near = step_held_incremental(plant, method, state, geometry, loop.control.voltage, dt, first)
+        plant_mode, near = loop.plant_mode, jnp.asarray(True)
+        if plants.has_events(plant):
+            after, plant_mode = _stepped(plant, method, state, plant_mode, loop.control.voltage, dt, first)
+        else:
+            after, near = step_held_incremental(plant, method, state, geometry, loop.control.voltage, dt, first)
         right = outlook.possible & near & plants.within(after, plant.limits)
-        return loop._replace(state=after, flag=loop.flag | jnp.where(right, np.int32(0), np.int32(NEEDS_RECOMPUTE)))
+        flag = loop.flag | jnp.where(right, np.int32(0), np.int32(NEEDS_RECOMPUTE))
+        return loop._replace(state=after, flag=flag, plant_mode=plant_mode)
     stopped = failures.is_stopped(loop.flag)
     going = ~stopped & outlook.possible
     safe, safe_first, safe_voltage = failures.safe(going, (state, first, loop.control.applied))
-    if settings.clock == "continuous":
+    plant_mode = loop.plant_mode
+    if plants.has_events(plant):
+        after, plant_mode = _stepped(plant, method, safe, plant_mode, safe_voltage, dt, safe_first)
+    elif settings.clock == "continuous":
         after = step_continuous(plant, controller, method, safe, loop.control.mode, dt, safe_first)
     else:
         after = step_held(plant, method, safe, safe_voltage, dt, safe_first)
     within, reason = failures.verdict(plant, after, outlook)
     good = going & within
-    state = jax.tree.map(lambda old, new: jnp.where(good, new, old), state, after)
-    return loop._replace(state=state, flag=loop.flag | jnp.where(stopped | good, np.int32(0), reason))
+    state, plant_mode = jax.tree.map(
+        lambda old, new: jnp.where(good, new, old), (state, loop.plant_mode), (after, plant_mode)
+    )
+    return loop._replace(
+        state=state, plant_mode=plant_mode, flag=loop.flag | jnp.where(stopped | good, np.int32(0), reason)
+    )
+
+
+def _stepped(
+    plant: Plant, method: Integrator, state: PlantState, mode: Tree, u: Float[Array, ""], dt: Step, first: Tree
+) -> tuple[PlantState, Tree]:
+    """Returns state and mode of a plant with events after one step."""
+    q, v, mode = step_with_event(plant, method, *plants.coordinates(plant, state), mode, u, dt, first)
+    return plants.state_of(plant, q, v), mode

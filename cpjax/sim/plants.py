@@ -96,6 +96,16 @@ class Eventful(Protocol):
         ...
 
 
+@runtime_checkable
+class Releasing(Protocol):
+    """An `Eventful` plant whose mode may end at once because its input changes at once, as a cart that is held until
+    the voltage steps. Without this, a mode ends only where a guard falls."""
+
+    def release(self, q: Tree, v: Tree, u: Scalar, mode: Tree) -> Tree:
+        """Returns the mode under the input u: called at the start, where the input steps, and after each jump."""
+        ...
+
+
 def has_events(plant: Any) -> bool:
     """Returns whether a plant is `Eventful`. (`isinstance` with a protocol would take longer than a whole check.)"""
     return all(hasattr(plant, name) for name in ("start_mode", "guards", "jump"))
@@ -183,6 +193,41 @@ def saturate(plant: Plant, command: Float[Array, ""]) -> Float[Array, ""]:
 def start_mode(plant: Plant, q: Tree, v: Tree) -> Tree:
     """Returns the plant's own mode at the start; () for a plant without modes."""
     return jax.tree.map(jnp.asarray, call("plant", plant, "start_mode", q, v)) if has_events(plant) else ()
+
+
+def release(plant: Any, q: Tree, v: Tree, u: Scalar, mode: Tree) -> Tree:
+    """Returns the plant's own mode under an input that has changed at once; unchanged without a `release`."""
+    if not hasattr(plant, "release"):
+        return mode
+    return like("plant.release", call("plant", plant, "release", q, v, u, mode), mode)
+
+
+def guards(plant: Plant, q: Tree, v: Tree, u: Float[Array, ""], mode: Tree) -> tuple[Scalar, ...]:
+    """Returns the plant's own guards, () for a plant without events.
+
+    Raises:
+      InputError: the plant's `guards` returns no tuple of scalars.
+    """
+    if not has_events(plant):
+        return ()
+    found = call("plant", plant, "guards", q, v, u, mode)
+    if not isinstance(found, tuple):
+        raise InputError("plant.guards", f"a {type(found).__name__}", "a tuple of scalars")
+    return tuple(real(f"plant.guards[{i}]", guard, jnp.asarray(u).dtype) for i, guard in enumerate(found))
+
+
+def jump(plant: Any, q: Tree, v: Tree, u: Scalar, mode: Tree, guard: Int[Array, ""]) -> tuple[Tree, Tree, Tree]:
+    """Returns positions, velocities and the plant's mode after its own guard of this number (int32) has fallen.
+
+    Raises:
+      InputError: the plant's `jump` returns another tree structure.
+    """
+    after = call("plant", plant, "jump", q, v, mode, guard)
+    found: Any = jax.tree.structure(after)
+    if found != jax.tree.structure((q, v, mode)):
+        raise InputError("plant.jump", str(found), "positions, velocities and mode, as given")
+    q, v, mode = jax.tree.map(lambda new, old: jnp.asarray(new, dtype=jnp.asarray(old).dtype), after, (q, v, mode))
+    return q, v, release(plant, q, v, u, mode)
 
 
 def outputs(plant: Plant, state: PlantState, acceleration: Tree, u: Scalar) -> dict[str, Float[Array, ""]]:

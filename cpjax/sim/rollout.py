@@ -25,6 +25,7 @@ from cpjax.controllers.protocol import (
 )
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
+from cpjax.plant.contact import in_contact
 from cpjax.pytree import as_arguments, check, pytree, reveal
 from cpjax.rig import Rig
 from cpjax.sim import located, per_step
@@ -141,7 +142,9 @@ def prepared(
       InputError: as `rollout` does.
     """
     rig = plant if isinstance(plant, Rig) else None
-    plant = plant if rig is None else rig.dynamics
+    whole = plant if rig is None else rig
+    if isinstance(plant, (Rig, CartPole)):
+        plant = plant.dynamics if isinstance(plant, Rig) else in_contact(plant)
     check_plant(plant)
     settings = check_settings(**simulation, events=has_events(plant))
     name = "starts" if batched else "start"
@@ -158,9 +161,9 @@ def prepared(
         if not hasattr(plant, "input_limit"):
             raise InputError("plant", plant, "one with input_limit, for located switching on the continuous clock")
     if metrics is None:
-        if rig is None and not isinstance(plant, CartPole) and settings.save_every is None:
+        if not isinstance(whole, (Rig, CartPole)) and settings.save_every is None:
             raise InputError("metrics", None, "given: the default ProtocolMetrics() are those of a cpjax.CartPole")
-        metrics = default_metrics(plant if rig is None else rig)
+        metrics = default_metrics(whole)
     present = {name for name in ("init", "update", "finalize", "finish") if callable(getattr(metrics, name, None))}
     if isinstance(metrics, type) or not present >= {"init", "update"} or not present & {"finalize", "finish"}:
         raise InputError("metrics", metrics, "a metric with init, update and finalize, such as cpjax.ProtocolMetrics()")

@@ -27,7 +27,8 @@ class Simulation(TypedDict, total=False):
         on the continuous clock: changes of mode, and the instants at which the voltage reaches or leaves its limit, are
         found inside their steps, and derivatives include how they move with the parameters (see docs/gradients.md). In
         each mode the law must be continuous in the state; a StateFeedback alone is not, at theta = pi. The events of a
-        plant that has some (`cpjax.sim.plants.Eventful`) are located on either clock.
+        plant that has some (dry friction, stops, `cpjax.sim.plants.Eventful`) are located on the continuous clock; on
+        the sampled clock "per_step" finds the first one in each step, and "located" all of them.
       integrator: a key of `cpjax.sim.integrators.INTEGRATORS`; "rk4" by default.
       save_every: number of steps between saved samples, a divisor of the number of steps. None saves no trajectory.
         `rollout` saves every step by default, `sweep` none; `measure` does not take it.
@@ -108,7 +109,7 @@ def check_settings(
     """Checks the arguments of `Simulation` and returns the settings of a rollout.
 
     Args:
-      events: whether the plant has events of its own, which are located on either clock.
+      events: whether the plant has events of its own.
 
     Raises:
       InputError: as `rollout` does.
@@ -123,12 +124,13 @@ def check_settings(
     if clock is None:
         clock = "continuous" if switching == "located" else "sampled"
     if switching is None:
-        switching = "located" if events else "per_step"
+        switching = "located" if events and clock == "continuous" else "per_step"
     if switching == "located" and clock != "continuous" and not events:
         allowed = "per_step on the sampled clock: a held control changes mode only at its samples"
         raise InputError("switching", switching, allowed)
-    if switching == "per_step" and events:
-        raise InputError("switching", switching, "located, or absent, for a plant with events of its own")
+    if switching == "per_step" and events and clock == "continuous":
+        allowed = "located, or absent, for a plant with events of its own on the continuous clock"
+        raise InputError("switching", switching, allowed)
     if spare_steps is None:
         spare_steps = 64 + steps // 16 if switching == "located" else 0
     elif switching != "located":

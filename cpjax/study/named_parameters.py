@@ -15,7 +15,7 @@ from cpjax.errors import InputError
 from cpjax.linear.lqr import lqr
 from cpjax.linear.placement import place_polynomial
 from cpjax.plant import CartPole, linearize, with_parameters
-from cpjax.pytree import numbers
+from cpjax.pytree import numbers, present
 
 Build: TypeAlias = Callable[[Mapping[str, Float[Array, "..."]]], tuple[CartPole, Controller | Law]]
 """Function from parameters by name, possibly traced, to plant and controller."""
@@ -47,7 +47,7 @@ def parametrise(plant: CartPole, controller: Hybrid) -> Parametrisation:
     if not isinstance(controller, Hybrid) or not isinstance(controller.regulator, StateFeedback):
         raise InputError("controller", controller, "a cpjax.Hybrid with a cpjax.StateFeedback")
     law, gate, reference = controller.swing_up, controller.gate, controller.regulator.reference
-    of_plant = {name: rule for name, rule in numbers(type(plant)).items() if rule.uncertain}
+    of_plant = {name: rule for name, rule in present(plant).items() if rule.uncertain}
     parameters: dict[str, Any] = {name: float(getattr(plant, name)) for name in of_plant}
     if math.isfinite(float(plant.motor.voltage_limit)):
         parameters["voltage_limit"] = float(plant.motor.voltage_limit)

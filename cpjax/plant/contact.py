@@ -1,0 +1,252 @@
+"""Dry friction that sticks, of cart and pivot, and stops at the ends of the track: a cart-pole with modes.
+
+Cart and pole each slide in one direction, or are at rest and held. In each mode the equations of motion are smooth:
+
+    sliding   dry friction is -F_c sign(x'), until x' reaches 0
+    held      x'' = 0, while the force that holds the cart, the opposite of the other forces, is at most the static
+              friction F_s = `static_friction_ratio` F_c
+    stopped   the cart stands against a stop, which only pushes
+
+and likewise for the pole with the pivot's friction torque. A step of the integrator stays in one mode (see
+`cpjax.sim.plants.Eventful`), so friction is neither smoothed nor creeps: a held cart has x' = 0 exactly.
+
+A stop acts on the cart alone, within no time: x' becomes -`restitution` x', and the pole's row of the equations of
+motion gives (J + m l^2) d(theta') = m l cos(theta) d(x').
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from cpjax.plant.cartpole import CartPole, Pair
+from cpjax.plant.state import State
+from cpjax.pytree import Scalar, part, pytree
+
+HELD, AT_STOP = 0, 2
+"""Modes: -1 and 1 slide in that direction, `HELD` is at rest, -`AT_STOP` and `AT_STOP` is the cart at that stop."""
+
+_SLOWEST_REBOUND = 1e-3
+"""Rebounds of the cart below this speed [m/s] end at rest: with restitution, infinitely many follow one another."""
+
+_NO_END = 1.0
+"""Guard of a mode that ends otherwise."""
+
+
+class ContactMode(NamedTuple):
+    """Mode of a cart-pole in contact, int32 each."""
+
+    cart: Int[Array, ""]
+    pole: Int[Array, ""]
+
+
+@pytree
+class InContact:
+    """A `CartPole` with dry friction, stops or both, as the loop integrates it: a `cpjax.sim.plants.Eventful` plant."""
+
+    free: CartPole = part("a cpjax.CartPole", "accelerations", "solved")
+    half_length: Scalar | None = None
+    """Stops at this distance from the middle [m]; None for no stops."""
+    restitution: Scalar = 0.0
+    """Speed of the cart after a stop to that before [1]."""
+
+    @property
+    def limits(self) -> State:
+        """Largest allowed magnitude of each component of the state."""
+        return self.free.limits
+
+    @property
+    def input_limit(self) -> Scalar:
+        """Voltage at which the drive clips [V]."""
+        return self.free.input_limit
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the state's components by name, for error messages."""
+        return self.free.units
+
+    def coordinates(self, state: State) -> tuple[Pair, Pair]:
+        return self.free.coordinates(state)
+
+    def state(self, q: Pair, v: Pair) -> State:
+        return self.free.state(q, v)
+
+    def saturate(self, command: Scalar) -> Scalar:
+        return self.free.saturate(command)
+
+    def geometry(self, q: Pair) -> Pair:
+        return self.free.geometry(q)
+
+    def geometry_near(self, geometry: Pair, change: Pair) -> tuple[Pair, Bool[Array, ""]]:
+        return self.free.geometry_near(geometry, change)
+
+    def outputs(self, state: State, acceleration: Pair, u: Scalar) -> dict[str, Scalar]:
+        return self.free.outputs(state, acceleration, u)
+
+    def accelerations(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
+        """Returns (x'', theta'') [m/s^2, rad/s^2] in the mode; exactly 0 for what is held."""
+        sin, cos = geometry
+        push, torque = self._loads(geometry, v, u, mode)
+        x_ddot, theta_ddot = self.free.solved(sin, cos, push, torque)
+        resting, held = self._resting(mode)
+        alone_x, alone_theta = self._one_at_rest(push, torque)
+        x_ddot = jnp.where(resting, 0.0, jnp.where(held, alone_x, x_ddot))
+        theta_ddot = jnp.where(held, 0.0, jnp.where(resting, alone_theta, theta_ddot))
+        return x_ddot, theta_ddot
+
+    def start_mode(self, q: Pair, v: Pair) -> ContactMode:
+        """Returns the mode at the start: what moves slides, what rests is held until the input is known."""
+        dry = self.free.coulomb_friction is not None, self.free.pivot_coulomb_friction is not None
+        cart, pole = (
+            jnp.sign(rate).astype(jnp.int32) if sticks else jnp.ones_like(rate, dtype=jnp.int32)
+            for rate, sticks in zip(v, dry, strict=True)
+        )
+        if self.half_length is not None:
+            cart = jnp.where((q[0] >= self.half_length) & (v[0] >= 0.0), AT_STOP, cart)
+            cart = jnp.where((q[0] <= -self.half_length) & (v[0] <= 0.0), -AT_STOP, cart)
+        return ContactMode(cart, pole)
+
+    def guards(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> tuple[Scalar, ...]:
+        """Returns what ends a mode below zero: of the cart, of the pole, then the distances to the stops."""
+        cart, pole = self._forces(self.geometry(q), v, u, mode)
+        static_x, static_theta = self._static()
+        speed = None if self.free.coulomb_friction is None else v[0]
+        return (
+            *_ends(mode.cart, speed, cart, static_x),
+            *(() if self.free.pivot_coulomb_friction is None else _ends(mode.pole, v[1], pole, static_theta)),
+            *self._stops(q, mode),
+        )
+
+    def jump(self, q: Pair, v: Pair, mode: ContactMode, guard: Int[Array, ""]) -> tuple[Pair, Pair, ContactMode]:
+        """Returns positions, velocities and mode after a guard has fallen."""
+        cart, pole = mode
+        x, x_dot = q[0], v[0]
+        theta_dot = v[1]
+        sliding = jnp.abs(cart) == 1
+        # Guards 0 and 1: a sliding cart has come to rest; a held one is pushed to the right (0) or to the left (1).
+        of_cart = (guard == 0) | (guard == 1)
+        away = jnp.where(guard == 0, 1, -1)
+        x_dot = jnp.where(of_cart & sliding, 0.0, x_dot)
+        leaving = jnp.where(cart == HELD, away, -jnp.sign(cart))  # from a stop, away from it
+        after = jnp.where(of_cart, jnp.where(sliding, HELD, leaving), cart)
+        number = 2
+        if self.free.pivot_coulomb_friction is not None:
+            of_pole = (guard == 2) | (guard == 3)
+            turning = jnp.abs(pole) == 1
+            theta_dot = jnp.where(of_pole & turning, 0.0, theta_dot)
+            pole = jnp.where(of_pole, jnp.where(turning, HELD, jnp.where(guard == 2, 1, -1)), pole)
+            number = 4
+        if self.half_length is not None:
+            hits = guard >= number
+            side = jnp.where(guard == number, 1, -1)
+            back = -self.restitution * x_dot
+            rebounds = jnp.abs(back) >= _SLOWEST_REBOUND
+            new = jnp.where(rebounds, back, 0.0)
+            turn = self._coupling(self.geometry(q)) * (new - x_dot) / self.free.pivot_inertia
+            theta_dot = jnp.where(hits, theta_dot + turn, theta_dot)
+            x = jnp.where(hits, side * self.half_length, x)
+            x_dot = jnp.where(hits, new, x_dot)
+            after = jnp.where(hits, jnp.where(rebounds, -side, AT_STOP * side), after)
+            # A held pole that the impact turns slides from then on.
+            pole = jnp.where(hits & (pole == HELD), jnp.sign(theta_dot).astype(pole.dtype), pole)
+        return (x, q[1]), (x_dot, theta_dot), ContactMode(after.astype(cart.dtype), pole.astype(cart.dtype))
+
+    def release(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> ContactMode:
+        """Returns the mode that the input imposes at once: what is held slides where the static friction is exceeded.
+
+        Each is released in turn, with the other's state known: first the cart, then the pole, then the cart again.
+        """
+        geometry = self.geometry(q)
+        static_x, static_theta = self._static()
+        for axis in ("cart", "pole", "cart"):
+            cart, pole = self._forces(geometry, v, u, mode)
+            if axis == "pole":
+                loose = (mode.pole == HELD) & (jnp.abs(pole) > static_theta)
+                mode = mode._replace(pole=jnp.where(loose, jnp.sign(pole).astype(mode.pole.dtype), mode.pole))
+                continue
+            loose = (mode.cart == HELD) & (jnp.abs(cart) > static_x)
+            loose |= (mode.cart == AT_STOP) & (cart < -static_x) | (mode.cart == -AT_STOP) & (cart > static_x)
+            mode = mode._replace(cart=jnp.where(loose, jnp.sign(cart).astype(mode.cart.dtype), mode.cart))
+        return mode
+
+    def _static(self) -> tuple[Scalar, Scalar]:
+        """Returns the largest holding force [N] and torque [N m]."""
+        ratio = self.free.static_friction_ratio
+        x, theta = self.free.coulomb_friction, self.free.pivot_coulomb_friction
+        return (0.0 if x is None else ratio * x), (0.0 if theta is None else ratio * theta)
+
+    def _resting(self, mode: ContactMode) -> tuple[Array, Array]:
+        """Returns whether the cart and whether the pole is at rest."""
+        return (mode.cart == HELD) | (jnp.abs(mode.cart) == AT_STOP), mode.pole == HELD
+
+    def _loads(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
+        """Returns force on the cart [N] and torque on the pole [N m], with the friction of what slides."""
+        free = self.free
+        x_ddot, theta_ddot = free.accelerations(geometry, v, u)  # whatever forces the plant has
+        coupling = self._coupling(geometry)
+        push = (free.moving_mass + free.pole_mass) * x_ddot - coupling * theta_ddot
+        torque = free.pivot_inertia * theta_ddot - coupling * x_ddot
+        push, torque = jnp.asarray(push), jnp.asarray(torque)
+        if free.coulomb_friction is not None:
+            direction = jnp.where(jnp.abs(mode.cart) == 1, mode.cart, 0).astype(push.dtype)
+            push = push - direction * free.coulomb_friction
+        if free.pivot_coulomb_friction is not None:
+            torque = torque - mode.pole.astype(torque.dtype) * free.pivot_coulomb_friction
+        return push, torque
+
+    def _coupling(self, geometry: Pair) -> Scalar:
+        """Returns m l cos(theta) [kg m]."""
+        return self.free.pole_mass * self.free.pole_length * geometry[1]
+
+    def _one_at_rest(self, push: Scalar, torque: Scalar) -> Pair:
+        """Returns x'' with the pole at rest, and theta'' with the cart at rest."""
+        free = self.free
+        return push / (free.moving_mass + free.pole_mass), torque / free.pivot_inertia
+
+    def _forces(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
+        """Returns the force [N] and the torque [N m] that would move cart and pole from rest, friction apart."""
+        push, torque = self._loads(geometry, v, u, mode)
+        coupling = self._coupling(geometry)
+        resting, held = self._resting(mode)
+        alone_x, alone_theta = self._one_at_rest(push, torque)
+        return (
+            push + coupling * jnp.where(held, 0.0, alone_theta),
+            torque + coupling * jnp.where(resting, 0.0, alone_x),
+        )
+
+    def _stops(self, q: Pair, mode: ContactMode) -> tuple[Scalar, ...]:
+        """Returns the distances to the stops."""
+        if self.half_length is None:
+            return ()
+        right = jnp.where(mode.cart == AT_STOP, _NO_END, self.half_length - q[0])
+        left = jnp.where(mode.cart == -AT_STOP, _NO_END, self.half_length + q[0])
+        return right, left
+
+
+def in_contact(plant: CartPole, half_length: Scalar | None = None, restitution: Scalar = 0.0) -> CartPole | InContact:
+    """Returns a plant as the loop integrates it: unchanged if it has neither dry friction nor stops.
+
+    Args:
+      plant: the cart-pole.
+      half_length: of a track with stops at its ends [m]; None for no stops.
+      restitution: speed of the cart after a stop to that before [1].
+    """
+    if half_length is None and plant.coulomb_friction is None and plant.pivot_coulomb_friction is None:
+        return plant
+    return InContact(plant, half_length, restitution)
+
+
+def _ends(mode: Int[Array, ""], rate: Scalar | None, force: Scalar, static: Scalar) -> tuple[Scalar, Scalar]:
+    """Returns the two guards of one axis.
+
+    Sliding: the speed (None without dry friction), and none. Held: what is left of the static friction towards the
+    right, and towards the left.
+    At a stop: what is left of the force that presses the cart against it, static friction included, and none.
+    """
+    sliding = jnp.abs(mode) == 1
+    stopped = jnp.abs(mode) == AT_STOP
+    side = jnp.sign(mode).astype(jnp.asarray(force).dtype)
+    speed = _NO_END if rate is None else side * rate
+    first = jnp.where(sliding, speed, jnp.where(stopped, side * force + static, static - force))
+    second = jnp.where(sliding | stopped, _NO_END, static + force)
+    return first, second
