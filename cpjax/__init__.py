@@ -55,7 +55,7 @@ from cpjax.plant import (
     sample_starts,
 )
 from cpjax.presets import preset
-from cpjax.rig import Drive, Encoders, Rig, Track, rig
+from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, Track, Wind, rig
 from cpjax.sim.flags import Flag
 from cpjax.sim.gradients import Gradients, gradients
 from cpjax.sim.metrics import Metrics, ProtocolMetrics, TimeOutside
@@ -80,6 +80,7 @@ __all__ = [
     "DamagedFileWarning",
     "DerivativeWarning",
     "Digital",
+    "Disturbance",
     "Drive",
     "Encoders",
     "EnergySwingUp",
@@ -99,7 +100,9 @@ __all__ = [
     "PerformanceWarning",
     "PoleFactors",
     "ProtocolMetrics",
+    "Pushes",
     "QuadraticFactors",
+    "RandomPushes",
     "Rig",
     "Simulation",
     "SmoothClip",
@@ -110,6 +113,7 @@ __all__ = [
     "Track",
     "Trajectory",
     "VoltageSignal",
+    "Wind",
     "__version__",
     "as_sampled",
     "care",

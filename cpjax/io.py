@@ -37,7 +37,7 @@ from cpjax.files import dump_json, read_table, suffix_of, write_text
 from cpjax.plant import CartPole, ForceActuator, LumpedMotor, Motor
 from cpjax.plant.state import State
 from cpjax.pytree import is_traced
-from cpjax.rig import Drive, Encoders, Rig, Track
+from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, Track, Wind
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import Trajectory
 
@@ -72,6 +72,10 @@ TYPES: dict[str, type] = {
         Encoders,
         Drive,
         Track,
+        Disturbance,
+        Pushes,
+        RandomPushes,
+        Wind,
         Rig,
         Digital,
         FilteredDerivative,

@@ -14,7 +14,8 @@ A stop acts on the cart alone, within no time: x' becomes -`restitution` x', and
 motion gives (J + m l^2) d(theta') = m l cos(theta) d(x').
 """
 
-from typing import NamedTuple
+import dataclasses
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
@@ -65,6 +66,10 @@ class InContact:
         """Units of the state's components by name, for error messages."""
         return self.free.units
 
+    def __getattr__(self, name: str) -> Any:
+        # What a plant on the bench has beside, such as a drive with a memory.
+        return getattr(object.__getattribute__(self, "free"), name)
+
     def coordinates(self, state: State) -> tuple[Pair, Pair]:
         return self.free.coordinates(state)
 
@@ -85,21 +90,20 @@ class InContact:
 
     def accelerations(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
         """Returns (x'', theta'') [m/s^2, rad/s^2] in the mode; exactly 0 for what is held."""
-        sin, cos = geometry
-        push, torque = self._loads(geometry, v, u, mode)
-        x_ddot, theta_ddot = self.free.solved(sin, cos, push, torque)
+        push, torque, *others = self._loads(geometry, v, u, mode)
+        x_ddot, theta_ddot = self.free.solved(geometry[0], geometry[1], push, torque)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)
         x_ddot = jnp.where(resting, 0.0, jnp.where(held, alone_x, x_ddot))
         theta_ddot = jnp.where(held, 0.0, jnp.where(resting, alone_theta, theta_ddot))
-        return x_ddot, theta_ddot
+        return (x_ddot, theta_ddot, *others)
 
     def start_mode(self, q: Pair, v: Pair) -> ContactMode:
         """Returns the mode at the start: what moves slides, what rests is held until the input is known."""
         dry = self.free.coulomb_friction is not None, self.free.pivot_coulomb_friction is not None
         cart, pole = (
             jnp.sign(rate).astype(jnp.int32) if sticks else jnp.ones_like(rate, dtype=jnp.int32)
-            for rate, sticks in zip(v, dry, strict=True)
+            for rate, sticks in zip(v[:2], dry, strict=True)
         )
         if self.half_length is not None:
             cart = jnp.where((q[0] >= self.half_length) & (v[0] >= 0.0), AT_STOP, cart)
@@ -149,7 +153,7 @@ class InContact:
             after = jnp.where(hits, jnp.where(rebounds, -side, AT_STOP * side), after)
             # A held pole that the impact turns slides from then on.
             pole = jnp.where(hits & (pole == HELD), jnp.sign(theta_dot).astype(pole.dtype), pole)
-        return (x, q[1]), (x_dot, theta_dot), ContactMode(after.astype(cart.dtype), pole.astype(cart.dtype))
+        return (x, *q[1:]), (x_dot, theta_dot, *v[2:]), ContactMode(after.astype(cart.dtype), pole.astype(cart.dtype))
 
     def release(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> ContactMode:
         """Returns the mode that the input imposes at once: what is held slides where the static friction is exceeded.
@@ -169,6 +173,13 @@ class InContact:
             mode = mode._replace(cart=jnp.where(loose, jnp.sign(cart).astype(mode.cart.dtype), mode.cart))
         return mode
 
+    def during(
+        self, memory: Any, index: Int[Array, ""], dt: Scalar, state: State, u: Scalar
+    ) -> tuple["InContact", Any]:
+        """Returns the plant as it is during a step; see `cpjax.sim.plants.Stepped`."""
+        free, memory = self.free.during(memory, index, dt, state, u)
+        return dataclasses.replace(self, free=free), memory
+
     def _static(self) -> tuple[Scalar, Scalar]:
         """Returns the largest holding force [N] and torque [N m]."""
         ratio = self.free.static_friction_ratio
@@ -182,7 +193,7 @@ class InContact:
     def _loads(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
         """Returns force on the cart [N] and torque on the pole [N m], with the friction of what slides."""
         free = self.free
-        x_ddot, theta_ddot = free.accelerations(geometry, v, u)  # whatever forces the plant has
+        x_ddot, theta_ddot, *others = free.accelerations(geometry, v, u)  # whatever forces the plant has
         coupling = self._coupling(geometry)
         push = (free.moving_mass + free.pole_mass) * x_ddot - coupling * theta_ddot
         torque = free.pivot_inertia * theta_ddot - coupling * x_ddot
@@ -192,7 +203,7 @@ class InContact:
             push = push - direction * free.coulomb_friction
         if free.pivot_coulomb_friction is not None:
             torque = torque - mode.pole.astype(torque.dtype) * free.pivot_coulomb_friction
-        return push, torque
+        return (push, torque, *others)
 
     def _coupling(self, geometry: Pair) -> Scalar:
         """Returns m l cos(theta) [kg m]."""
@@ -205,7 +216,7 @@ class InContact:
 
     def _forces(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
         """Returns the force [N] and the torque [N m] that would move cart and pole from rest, friction apart."""
-        push, torque = self._loads(geometry, v, u, mode)
+        push, torque, *_ = self._loads(geometry, v, u, mode)
         coupling = self._coupling(geometry)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)

@@ -1,4 +1,4 @@
-"""Drives of the cart: a DC motor without inductance with gear and wheel, its lumped form, and a force."""
+"""Drives of the cart: a DC motor with gear and wheel, its lumped form, and a force."""
 
 from typing import Any
 
@@ -15,10 +15,11 @@ def _at_the_rotor(of_the_cart: float, plant: Any) -> Scalars:
 
 @pytree
 class Motor:
-    """A DC motor without inductance, a gear and a wheel that does not slip. Defaults: the paper's appendix.
+    """A DC motor, a gear and a wheel that does not slip. Defaults: the paper's appendix.
 
     A terminal voltage u drives the current i = (u - k_V n x' / r) / R, and the wheels exert on the cart the force
-    F = n k_T i / r - n^2 B_m x' / r^2.
+    F = n k_T i / r - n^2 B_m x' / r^2. With an `inductance` L, the current follows that value with the time constant
+    L / R (on the sampled clock); the linear model and the methods here leave it out.
     """
 
     torque_constant: Scalars = number("N m/A", "torque per current, k_T", default=1.25, above=0.0, uncertain=True)
@@ -50,6 +51,9 @@ class Motor:
     gear_ratio: Scalars = number("1", "rotor turns per wheel turn, n", default=1.0, above=0.0)
     voltage_limit: Scalars = number(
         "V", "supply: |u| is clipped here", default=12.0, above=0.0, infinite=True, linear=False
+    )
+    inductance: Scalars | None = number(
+        "H", "inductance of the winding, L", default=None, above=0.0, linear=False, optional=True
     )
 
     def saturate(self, voltage: Scalars) -> Float[Array, "*batch"]:

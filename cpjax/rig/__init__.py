@@ -1,9 +1,22 @@
-"""Parts of a rig beside its plant: sensors, drive and track."""
+"""Parts of a rig beside its plant: sensors, drive, track and disturbance."""
 
 from cpjax.rig.bench import Rig
+from cpjax.rig.disturbance import Disturbance, Pushes, RandomPushes, Wind
 from cpjax.rig.drive import Drive
 from cpjax.rig.presets import PRESETS, rig
 from cpjax.rig.sensors import Encoders, Position
 from cpjax.rig.track import Track
 
-__all__ = ["PRESETS", "Drive", "Encoders", "Position", "Rig", "Track", "rig"]
+__all__ = [
+    "PRESETS",
+    "Disturbance",
+    "Drive",
+    "Encoders",
+    "Position",
+    "Pushes",
+    "RandomPushes",
+    "Rig",
+    "Track",
+    "Wind",
+    "rig",
+]

@@ -1,13 +1,17 @@
-"""Rig: a plant with the sensors, the drive and the track that it has on the bench."""
+"""Rig: a plant with the sensors, the drive, the track and the disturbances that it has on the bench."""
 
-import dataclasses
+import math
 from typing import Any
 
+import numpy as np
+
 from cpjax.errors import InputError
-from cpjax.plant import CartPole
-from cpjax.plant.contact import InContact, in_contact
-from cpjax.pytree import Scalar, part, pytree
+from cpjax.plant import CartPole, Motor
+from cpjax.plant.contact import in_contact
+from cpjax.pytree import is_traced, part, pytree
+from cpjax.rig.disturbance import Disturbance
 from cpjax.rig.drive import Drive
+from cpjax.rig.dynamics import ChangingBench, OnTheBench
 from cpjax.rig.sensors import Encoders
 from cpjax.rig.track import Track
 
@@ -23,60 +27,46 @@ class Rig:
     """None applies the clipped command at once."""
     track: Track | None = None
     """None is endless."""
+    disturbance: Disturbance | None = None
+    """None is a level rail on which nothing pushes."""
 
     def __post_init__(self) -> None:
-        for name, kind in (("sensors", Encoders), ("drive", Drive), ("track", Track)):
+        kinds = {"sensors": Encoders, "drive": Drive, "track": Track, "disturbance": Disturbance}
+        for name, kind in kinds.items():
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise InputError(f"Rig.{name}", value, f"a cpjax.{kind.__name__}, or None for an ideal one")
+        motor = self.plant.motor
+        if self.drive is not None and self.drive.source_resistance is not None:
+            if not isinstance(motor, Motor) or motor.inductance is not None:
+                allowed = "None, unless the plant has a cpjax.Motor without inductance, whose current is known"
+                raise InputError("Drive.source_resistance", self.drive.source_resistance, allowed)
+            limit = motor.voltage_limit
+            if not is_traced(limit) and not np.ndim(limit) and not math.isfinite(float(limit)):
+                raise InputError("Motor.voltage_limit", limit, "finite, where the supply sags")
 
     @property
     def dynamics(self) -> Any:
-        """The plant as the loop sees it, with the drive's dead band and the track's ends."""
+        """The plant as the loop sees it: the `CartPole` itself, if nothing on the bench changes how it moves."""
+        return self.moving(0, 0)
+
+    def moving(self, seed: Any, run: Any) -> Any:
+        """Returns `dynamics` with the noise of a rollout.
+
+        Args:
+          seed: of what is random, uint32.
+          run: number of the run, uint32, or of each run.
+        """
         track = self.track
-        if track is not None and track.ends == "stop":
-            plant, track = in_contact(self.plant, track.half_length, track.restitution), None
-        else:
-            plant = in_contact(self.plant)
-        if self.drive is None and track is None:
-            return plant
-        return OnTheBench(plant, Drive() if self.drive is None else self.drive, track)
-
-
-@pytree
-class OnTheBench:
-    """A cart-pole with its drive and track, for the loop; with dry friction it also has the plant's modes."""
-
-    plant: CartPole | InContact = part("a cpjax.CartPole", "accelerations", "saturate")
-    drive: Drive = part("a cpjax.Drive", "apply")
-    track: Track | None = None
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(object.__getattribute__(self, "plant"), name)
-
-    @property
-    def limits(self) -> Any:
-        """Largest allowed magnitude of each component of the state."""
-        limits = self.plant.limits
-        return limits if self.track is None else dataclasses.replace(limits, x=self.track.half_length)
-
-    def coordinates(self, state: Any) -> Any:
-        return self.plant.coordinates(state)
-
-    def state(self, q: Any, v: Any) -> Any:
-        return self.plant.state(q, v)
-
-    def geometry(self, q: Any) -> Any:
-        return self.plant.geometry(q)
-
-    def geometry_near(self, geometry: Any, change: Any) -> Any:
-        return self.plant.geometry_near(geometry, change)
-
-    def accelerations(self, geometry: Any, v: Any, u: Scalar, *mode: Any) -> Any:
-        return self.plant.accelerations(geometry, v, u, *mode)
-
-    def outputs(self, state: Any, acceleration: Any, u: Scalar) -> Any:
-        return self.plant.outputs(state, acceleration, u)
-
-    def saturate(self, command: Scalar) -> Scalar:
-        return self.drive.apply(self.plant.saturate(command))
+        stops = track is not None and track.ends == "stop"
+        plant: Any = self.plant
+        on_bench = self.drive is not None or self.disturbance is not None or (track is not None and not stops)
+        inductive = getattr(plant.motor, "inductance", None) is not None
+        if on_bench or inductive:
+            drive = Drive() if self.drive is None else self.drive
+            parts = plant, drive, None if stops else track, self.disturbance
+            changes = inductive or drive.lag is not None or (self.disturbance is not None and self.disturbance.changes)
+            plant = ChangingBench(*parts, seed, run) if changes else OnTheBench(*parts)
+        if track is not None and stops:
+            return in_contact(plant, track.half_length, track.restitution)
+        return in_contact(plant)

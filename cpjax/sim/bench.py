@@ -13,13 +13,14 @@ from jaxtyping import Array, Int32
 from cpjax.checks import call, pair
 from cpjax.controllers.protocol import as_sampled
 from cpjax.errors import InputError
+from cpjax.numeric.noise import standard_normals
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, is_traced
 from cpjax.rig import Encoders, Position, Rig
 from cpjax.sim.settings import Settings
 
-_SENSORS = np.uint32(1)
-"""Second word of the noise's key; each source of noise has its own."""
+_SENSORS, _DRIVE = np.uint32(1), np.uint32(4)
+"""Second words of the noise's keys; each source of noise has its own (`cpjax.rig.disturbance` has 2 and 3)."""
 
 
 class BenchMemory(NamedTuple):
@@ -47,10 +48,12 @@ class Bench:
       divider: updates per control period.
       run: number of the run, which selects its noise.
       noisy: whether the sensors have noise.
+      drive_noise: standard deviation of the noise on the command [V]; None for none.
     """
 
     controller: Any
     sensors: Encoders | None
+    drive_noise: Any
     seed: Any
     run: Any
     delay: int
@@ -75,6 +78,11 @@ class Bench:
                 lambda new, old: jnp.where(due, new, old), (inner, command), (memory.inner, memory.held)
             )
         held = None if memory.held is None else command
+        if self.drive_noise is not None:
+            key = (jnp.asarray(self.seed, dtype=jnp.uint32), jnp.asarray(_DRIVE))
+            period = (memory.step // self.divider).astype(jnp.uint32)
+            normal, _ = standard_normals(key, (jnp.asarray(self.run), period), jnp.asarray(state.x).dtype)
+            command = command + self.drive_noise * normal
         line = (command, *memory.line)
         return BenchMemory(inner, memory.step + 1, line[:-1], held), line[-1]
 
@@ -98,7 +106,9 @@ def _needs_rates(sensors: Encoders | None) -> Iterator[None]:
 
 
 jax.tree_util.register_dataclass(
-    Bench, data_fields=["controller", "sensors", "seed", "run"], meta_fields=["delay", "divider", "noisy"]
+    Bench,
+    data_fields=["controller", "sensors", "drive_noise", "seed", "run"],
+    meta_fields=["delay", "divider", "noisy"],
 )
 
 
@@ -122,16 +132,18 @@ def on_bench(rig: Rig, controller: Any, settings: Settings, dt: float, seed: int
     steps = round(float(delay) / dt)
     if abs(float(delay) / dt - steps) > 1e-6 * max(1, steps):
         raise InputError("Drive.delay", delay, f"a whole number of steps of dt = {dt:g} s")
+    noise = None if rig.drive is None else rig.drive.noise
+    noise = noise if noise is not None and (is_traced(noise) or bool(np.any(np.asarray(noise)))) else None
     if settings.clock == "continuous":
-        if rig.sensors is not None or steps:
-            name = "sensors" if rig.sensors is not None else "drive.delay"
+        if rig.sensors is not None or steps or noise is not None:
+            name = "sensors" if rig.sensors is not None else "drive.delay" if steps else "drive.noise"
             raise InputError("clock", settings.clock, f"sampled: the rig's {name} act at control instants")
         return controller, settings
-    if rig.sensors is None and not steps:
+    if rig.sensors is None and not steps and noise is None:
         return controller, settings
     every, noisy = settings.steps_per_control, rig.sensors is not None and rig.sensors.noisy
     if steps % every == 0:
-        return Bench(controller, rig.sensors, np.uint32(seed), runs, steps // every, 1, noisy), settings
+        return Bench(controller, rig.sensors, noise, np.uint32(seed), runs, steps // every, 1, noisy), settings
     # A delay that ends between two control instants: the bench runs at every step.
-    bench = Bench(controller, rig.sensors, np.uint32(seed), runs, steps, every, noisy)
+    bench = Bench(controller, rig.sensors, noise, np.uint32(seed), runs, steps, every, noisy)
     return bench, settings._replace(steps_per_control=1)

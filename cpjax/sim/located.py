@@ -85,7 +85,7 @@ def simulate(
         # The first iteration after which the wanted number of grid points has been passed.
         wanted = jnp.arange(settings.save_every, settings.steps, settings.save_every, dtype=passed.dtype)
         rows = jnp.searchsorted(passed, wanted)
-        samples = jnp.concatenate([pack(first)[None], samples[rows]])
+        samples = jnp.concatenate([pack(first, plant)[None], samples[rows]])
     return samples, last, finalize_metric(metric, memory, last)
 
 
@@ -107,7 +107,7 @@ def _run(
         kept = memory, loop.voltage, loop.mode
         memory, voltage, mode = jax.tree.map(lambda new, old: jnp.where(reached, new, old), updated, kept)
         loop = loop._replace(voltage=voltage, mode=mode)
-        return (loop, memory), (None if settings.save_every is None else (pack(sample), loop.motion.grid_index))
+        return (loop, memory), (None if settings.save_every is None else (pack(sample, plant), loop.motion.grid_index))
 
     return scan(body, carry, jnp.arange(iterations, dtype=jnp.int32), settings.checkpoint)
 

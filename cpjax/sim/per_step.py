@@ -37,6 +37,10 @@ class _Instant(NamedTuple):
 
     accelerations: Tree
     geometry: Tree
+    plant: Any
+    """The plant as it is during the step."""
+    drive: Tree
+    """Memory of its drive after the step."""
 
 
 class _Loop(NamedTuple):
@@ -49,6 +53,8 @@ class _Loop(NamedTuple):
     """Number of consecutive control instants at which the mode changed."""
     plant_mode: Tree = ()
     """The plant's own mode; () for a plant without events."""
+    drive: Tree = ()
+    """Memory of the plant's drive; () for one without."""
 
 
 _Carry: TypeAlias = tuple[_Loop, MetricState]
@@ -62,7 +68,7 @@ def simulate(
     flag = nonfinite_flag((start, plant, controller))
     flag = jnp.where(flag != 0, np.int32(NEEDS_RECOMPUTE), flag) if settings.fast_path else flag
     plant_mode = plants.start_mode(plant, *plants.coordinates(plant, start))
-    loop = _Loop(start, control, flag, jnp.zeros_like(flag), plant_mode)
+    loop = _Loop(start, control, flag, jnp.zeros_like(flag), plant_mode, plants.start_drive(plant, start))
     _, first, _ = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
 
     started = start_metric(metric, first)
@@ -71,15 +77,16 @@ def simulate(
     carry = (loop, started)
     run = single_kernel(functools.partial(_run, settings=settings), stacks=True)
     (loop, memory), samples = run(carry, plant, controller, metric, dt)
-    after, last, _ = _observe(plant, controller, loop, jnp.asarray(settings.steps), dt, settings)
+    after, last, instant = _observe(plant, controller, loop, jnp.asarray(settings.steps), dt, settings)
     broken = nonfinite_input(last.voltage)  # of the last instant, after which no step looks at it
     broken = jnp.where(broken != 0, np.int32(NEEDS_RECOMPUTE), broken) if settings.fast_path else broken
     last = last._replace(flag=last.flag | broken)
     clean = last._replace(flag=last.flag & ~NEEDS_RECOMPUTE)
+    now = instant.plant
     memory = _fold(
-        metric, memory, clean, plant, loop.control, after.control, jnp.asarray(settings.steps), settings, update_metric
+        metric, memory, clean, now, loop.control, after.control, jnp.asarray(settings.steps), settings, update_metric
     )
-    return samples, _saved(plant, last, after), finalize_metric(metric, memory, clean)
+    return samples, _saved(now, last, after), finalize_metric(metric, memory, clean)
 
 
 def _run(
@@ -91,16 +98,17 @@ def _run(
     def body(carry: _Carry, index: Int[Array, ""]) -> tuple[_Carry, Float[Array, " columns"] | None]:
         before, memory = carry
         loop, sample, instant = _observe(plant, controller, before, index, dt, settings)
+        now = instant.plant
         memory = _fold(
-            metric, memory, sample, plant, before.control, loop.control, index, settings, outline(update_metric)
+            metric, memory, sample, now, before.control, loop.control, index, settings, outline(update_metric)
         )
-        saved = pack(_saved(plant, sample, loop)) if every == 1 else None
-        return (_advance(plant, controller, loop, instant, dt, settings), memory), saved
+        saved = pack(_saved(now, sample, loop), plant) if every == 1 else None
+        return (_advance(controller, loop, instant, dt, settings), memory), saved
 
     def block(carry: _Carry, index: Int[Array, ""]) -> tuple[_Carry, Float[Array, " columns"]]:
-        loop, sample, _ = _observe(plant, controller, carry[0], index, dt, settings)
+        loop, sample, instant = _observe(plant, controller, carry[0], index, dt, settings)
         carry, _ = scan(body, carry, index + jnp.arange(every), "every_step")
-        return carry, pack(_saved(plant, sample, loop))
+        return carry, pack(_saved(instant.plant, sample, loop), plant)
 
     if every is None:
         # With these compiler options, all that is stored for reverse mode would be copied at each step.
@@ -204,6 +212,7 @@ def _observe(
     flag = loop.flag | jnp.where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
     # The fast path never stops a run; it marks it for recomputation.
     going = jnp.asarray(True) if settings.fast_path else ~failures.is_stopped(flag)
+    plant, drive = plants.during(plant, loop.drive, index, dt, state, control.applied)
     q, v = plants.coordinates(plant, state)
     geometry = plants.geometry(plant, q)
     plant_mode = plants.release(plant, q, v, control.applied, loop.plant_mode)
@@ -225,13 +234,15 @@ def _observe(
     )
     if control.blend is not None:
         accelerations = outline(plants.accelerations)(plant, geometry, v, control.applied, plant_mode)
-    return _Loop(state, control, flag, changes, plant_mode), sample, _Instant(accelerations, geometry)
+    loop = _Loop(state, control, flag, changes, plant_mode, loop.drive)
+    return loop, sample, _Instant(accelerations, geometry, plant, drive)
 
 
-def _advance(plant: Plant, controller: Any, loop: _Loop, instant: _Instant, dt: Step, settings: Settings) -> _Loop:
+def _advance(controller: Any, loop: _Loop, instant: _Instant, dt: Step, settings: Settings) -> _Loop:
     """Integrates one step; a failed run is held and flagged: see `failures.py`."""
     state, method = loop.state, INTEGRATORS[settings.integrator]
-    first, geometry = instant
+    first, geometry, plant, drive = instant
+    loop = loop._replace(drive=drive)
     outlook = failures.look_ahead(plant, plants.coordinates(plant, state)[1], first, dt)
     if settings.fast_path:  # values only: no guarded derivatives, and failed runs are recomputed
         plant_mode, near = loop.plant_mode, jnp.asarray(True)

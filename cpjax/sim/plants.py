@@ -97,6 +97,47 @@ class Eventful(Protocol):
 
 
 @runtime_checkable
+class Stepped(Protocol):
+    """A plant that differs from step to step, by forces that depend on time, or by a drive with a memory of its own.
+
+    It runs on the sampled clock with switching per step.
+    """
+
+    def start_drive(self, state: PlantState) -> Tree:
+        """Returns the memory before the first step: any pytree of arrays."""
+        ...
+
+    def during(
+        self, memory: Tree, index: Int[Array, ""], dt: Scalar, state: PlantState, u: Scalar
+    ) -> tuple["Plant", Tree]:
+        """Returns the plant as it is during the step of this number (int32), and the memory after it."""
+        ...
+
+
+def is_stepped(plant: Any) -> bool:
+    """Returns whether a plant is `Stepped`."""
+    return hasattr(plant, "start_drive")
+
+
+def start_drive(plant: Any, state: PlantState) -> Tree:
+    """Returns the memory of a `Stepped` plant before the first step; () for another plant."""
+    return jax.tree.map(jnp.asarray, call("plant", plant, "start_drive", state)) if is_stepped(plant) else ()
+
+
+def during(plant: Any, memory: Tree, index: Int[Array, ""], dt: Scalar, state: PlantState, u: Scalar) -> Any:
+    """Returns the plant as it is during a step, and its memory after it; unchanged if it is not `Stepped`.
+
+    Raises:
+      InputError: the plant's `during` returns no pair, or a memory of another structure.
+    """
+    if not is_stepped(plant):
+        return plant, memory
+    returned = call("plant", plant, "during", memory, index, dt, state, u)
+    now, after = pair("plant.during", returned, "the plant in this step and the memory after it")
+    return now, like("plant.during: memory", after, memory)
+
+
+@runtime_checkable
 class Releasing(Protocol):
     """An `Eventful` plant whose mode may end at once because its input changes at once, as a cart that is held until
     the voltage steps. Without this, a mode ends only where a guard falls."""

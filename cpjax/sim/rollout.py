@@ -25,7 +25,6 @@ from cpjax.controllers.protocol import (
 )
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
-from cpjax.plant.contact import in_contact
 from cpjax.pytree import as_arguments, check, pytree, reveal
 from cpjax.rig import Rig
 from cpjax.sim import located, per_step
@@ -35,7 +34,7 @@ from cpjax.sim.flags import NEEDS_RECOMPUTE
 from cpjax.sim.initial import checked_initial
 from cpjax.sim.integrators import Step
 from cpjax.sim.metrics import Metric, NoMetrics, ProtocolMetrics, Sample
-from cpjax.sim.plants import Plant, PlantState, check_plant, has_events
+from cpjax.sim.plants import Plant, PlantState, check_plant, has_events, is_stepped
 from cpjax.sim.saved import SavedSamples, fields, keep
 from cpjax.sim.settings import Settings, Simulation, check_names, check_settings
 
@@ -141,12 +140,16 @@ def prepared(
     Raises:
       InputError: as `rollout` does.
     """
-    rig = plant if isinstance(plant, Rig) else None
+    rig = plant if isinstance(plant, Rig) else Rig(plant) if isinstance(plant, CartPole) else None
     whole = plant if rig is None else rig
-    if isinstance(plant, (Rig, CartPole)):
-        plant = plant.dynamics if isinstance(plant, Rig) else in_contact(plant)
+    plant = plant if rig is None else rig.dynamics
     check_plant(plant)
     settings = check_settings(**simulation, events=has_events(plant))
+    if is_stepped(plant) and (settings.clock == "continuous" or settings.switching == "located"):
+        allowed = (
+            "sampled, with switching per step: pushes, wind, a drive's lag and inductance change from step to step"
+        )
+        raise InputError("clock" if settings.clock == "continuous" else "switching", settings.clock, allowed)
     name = "starts" if batched else "start"
     start, dtype, count = checked_initial(plant, start, name, batched=batched)
     controller = without_design(as_controller(controller))
@@ -161,7 +164,7 @@ def prepared(
         if not hasattr(plant, "input_limit"):
             raise InputError("plant", plant, "one with input_limit, for located switching on the continuous clock")
     if metrics is None:
-        if not isinstance(whole, (Rig, CartPole)) and settings.save_every is None:
+        if rig is None and settings.save_every is None:
             raise InputError("metrics", None, "given: the default ProtocolMetrics() are those of a cpjax.CartPole")
         metrics = default_metrics(whole)
     present = {name for name in ("init", "update", "finalize", "finish") if callable(getattr(metrics, name, None))}
@@ -170,16 +173,19 @@ def prepared(
     if "finalize" not in present:
         message = f"{type(metrics).__name__}.finish is now called finalize; the old name goes with version 0.3"
         warnings.warn(message, DeprecationWarning, stacklevel=3)
+    runs = np.zeros((), np.uint32) if count is None else np.arange(count, dtype=np.uint32)
+    if rig is not None and is_stepped(plant):
+        plant = rig.moving(np.uint32(simulation.get("seed", 0)), runs)
     parts: tuple[tuple[str, Any], ...] = (("plant", plant), ("controller", controller), ("metrics", metrics))
     each = {name: check(name, part, count) for name, part in parts}
     if rig is not None:
-        runs = np.zeros((), np.uint32) if count is None else np.arange(count, dtype=np.uint32)
         bare = controller
         controller, settings = on_bench(
             rig, controller, settings, float(simulation["dt"]), simulation.get("seed", 0), runs
         )
         if controller is not bare:
-            each["controller"] += [*check("rig.sensors", rig.sensors, count), False, count is not None]
+            noise = [] if controller.drive_noise is None else [np.ndim(controller.drive_noise) > 0]
+            each["controller"] += [*check("rig.sensors", rig.sensors, count), *noise, False, count is not None]
     parts = (("plant", plant), ("controller", controller), ("metrics", metrics))
     plant, controller, metrics = (as_arguments(name, part, dtype) for name, part in parts)
     dt = np.asarray(simulation["dt"], dtype=dtype)

@@ -25,14 +25,16 @@ class SavedSamples(NamedTuple):
     """Outputs of the plant by name."""
 
 
-def pack(sample: Sample) -> Float[Array, " columns"]:
+def pack(sample: Sample, plant: Plant) -> Float[Array, " columns"]:
     """Returns a sample as a row."""
-    return jnp.stack([field.astype(sample.time.dtype) for field in jax.tree.leaves(_packed_fields(sample))])
+    return jnp.stack([field.astype(sample.time.dtype) for field in jax.tree.leaves(_packed_fields(sample, plant))])
 
 
 def keep(packed: Float[Array, "rows columns"], plant: Plant, last: Sample) -> SavedSamples:
     """Returns packed rows with the plant's outputs added; `last` is a sample of the same run."""
-    fields = _unpacked([packed[:, i] for i in range(packed.shape[1])], last)
+    fields = _unpacked([packed[:, i] for i in range(packed.shape[1])], _packed_fields(last, plant))
+    if plants.is_stepped(plant):  # the plant of each step is gone
+        return SavedSamples(packed, fields.outputs)
 
     def row(fields: _PackedFields) -> dict[str, Float[Array, ""]]:
         q, v = plants.coordinates(plant, fields.state)
@@ -48,8 +50,11 @@ def fields(kept: SavedSamples, last: Sample) -> dict[str, Any]:
     def joined(many: Shaped[Array, " rows *batch"], one: Shaped[Array, "*batch"]) -> Shaped[Array, "*batch samples"]:
         return jnp.concatenate([jnp.moveaxis(many, 0, -1).astype(one.dtype), one[..., None]], axis=-1)
 
-    rows = _unpacked([kept.packed[..., i] for i in range(kept.packed.shape[-1])], last)
-    found = jax.tree.map(joined, rows, _packed_fields(last))._asdict()
+    columns = [kept.packed[..., i] for i in range(kept.packed.shape[-1])]
+    short = _short(last)
+    like = short if len(columns) == len(jax.tree.leaves(short)) else short._replace(outputs=last.outputs)
+    rows = _unpacked(columns, like)
+    found = jax.tree.map(joined, rows, like)._asdict()
     del found["plant_mode"]
     return {**found, "outputs": jax.tree.map(joined, kept.outputs, last.outputs)}
 
@@ -60,14 +65,23 @@ class _PackedFields(NamedTuple):
     voltage: Float[Array, "*shape"]
     mode: Int[Array, "*shape"]
     plant_mode: Tree
+    outputs: dict[str, Float[Array, "*shape"]]
+    """Empty where they follow from the other fields."""
 
 
-def _packed_fields(sample: Sample) -> _PackedFields:
-    return _PackedFields(sample.time, sample.state, sample.voltage, sample.mode, sample.plant_mode)
+def _short(sample: Sample) -> _PackedFields:
+    """Returns the fields from which the others follow."""
+    return _PackedFields(sample.time, sample.state, sample.voltage, sample.mode, sample.plant_mode, {})
 
 
-def _unpacked(columns: list[Float[Array, "..."]], like: Sample) -> _PackedFields:
-    ones, structure = jax.tree.flatten(_packed_fields(like))
+def _packed_fields(sample: Sample, plant: Plant) -> _PackedFields:
+    """Returns the fields that are saved: of a plant that differs from step to step its outputs as well."""
+    short = _short(sample)
+    return short._replace(outputs=sample.outputs) if plants.is_stepped(plant) else short
+
+
+def _unpacked(columns: list[Float[Array, "..."]], like: _PackedFields) -> _PackedFields:
+    ones, structure = jax.tree.flatten(like)
     typed = [column.astype(one.dtype) for column, one in zip(columns, ones, strict=True)]
     unpacked: _PackedFields = jax.tree.unflatten(structure, typed)
     return unpacked
