@@ -23,14 +23,17 @@ from cpjax.controllers import (
     EnergySwingUp,
     FilteredDerivative,
     Hybrid,
+    IntegralAction,
     LqrWeights,
     LyapunovGate,
+    MovingReference,
     Observer,
     PoleFactors,
     SingleLaw,
     SmoothClip,
     SmoothHybrid,
     StateFeedback,
+    VoltageSignal,
 )
 from cpjax.errors import InputError
 from cpjax.files import dump_json, read_table, suffix_of, write_text
@@ -80,6 +83,9 @@ TYPES: dict[str, type] = {
         Digital,
         FilteredDerivative,
         Observer,
+        IntegralAction,
+        MovingReference,
+        VoltageSignal,
         ProtocolMetrics,
         Metrics,
         Trajectory,

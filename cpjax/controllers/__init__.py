@@ -21,6 +21,7 @@ from cpjax.controllers.protocol import (
 )
 from cpjax.controllers.signal import VoltageSignal
 from cpjax.controllers.smooth import SmoothClip, SmoothHybrid
+from cpjax.controllers.tracking import IntegralAction, MovingReference
 
 __all__ = [
     "REGULATE",
@@ -37,11 +38,13 @@ __all__ = [
     "FilteredDerivative",
     "Gate",
     "Hybrid",
+    "IntegralAction",
     "Law",
     "LqrWeights",
     "LyapunovGate",
     "ModalController",
     "ModeMemory",
+    "MovingReference",
     "Observer",
     "PoleFactors",
     "Sampled",
