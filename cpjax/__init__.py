@@ -57,7 +57,7 @@ from cpjax.plant import (
     sample_starts,
 )
 from cpjax.presets import preset
-from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, Track, Wind, rig
+from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, StateSensors, Track, Wind, rig
 from cpjax.sim.flags import Flag
 from cpjax.sim.gradients import Gradients, gradients
 from cpjax.sim.metrics import Metrics, ProtocolMetrics, TimeOutside
@@ -113,6 +113,7 @@ __all__ = [
     "SmoothHybrid",
     "State",
     "StateFeedback",
+    "StateSensors",
     "TimeOutside",
     "Track",
     "Trajectory",

@@ -40,7 +40,7 @@ from cpjax.files import dump_json, read_table, suffix_of, write_text
 from cpjax.plant import CartPole, ForceActuator, LumpedMotor, Motor
 from cpjax.plant.state import State
 from cpjax.pytree import is_traced
-from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, Track, Wind
+from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, StateSensors, Track, Wind
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import Trajectory
 
@@ -73,6 +73,7 @@ TYPES: dict[str, type] = {
         LumpedMotor,
         ForceActuator,
         Encoders,
+        StateSensors,
         Drive,
         Track,
         Disturbance,

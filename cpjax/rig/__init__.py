@@ -4,7 +4,7 @@ from cpjax.rig.bench import Rig
 from cpjax.rig.disturbance import Disturbance, Pushes, RandomPushes, Wind
 from cpjax.rig.drive import Drive
 from cpjax.rig.presets import PRESETS, rig
-from cpjax.rig.sensors import Encoders, Position
+from cpjax.rig.sensors import Encoders, Position, StateSensors
 from cpjax.rig.track import Track
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "Pushes",
     "RandomPushes",
     "Rig",
+    "StateSensors",
     "Track",
     "Wind",
     "rig",

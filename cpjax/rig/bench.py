@@ -12,7 +12,7 @@ from cpjax.pytree import is_traced, part, pytree
 from cpjax.rig.disturbance import Disturbance
 from cpjax.rig.drive import Drive
 from cpjax.rig.dynamics import ChangingBench, OnTheBench
-from cpjax.rig.sensors import Encoders
+from cpjax.rig.sensors import Encoders, Sensors, StateSensors
 from cpjax.rig.track import Track
 
 
@@ -21,7 +21,7 @@ class Rig:
     """A plant on the bench. It is taken wherever a plant is; a part that is None is ideal and costs nothing."""
 
     plant: CartPole = part("a cpjax.CartPole", "accelerations", "saturate")
-    sensors: Encoders | None = None
+    sensors: Sensors | None = None
     """None measures the whole state without error."""
     drive: Drive | None = None
     """None applies the clipped command at once."""
@@ -31,11 +31,17 @@ class Rig:
     """None is a level rail on which nothing pushes."""
 
     def __post_init__(self) -> None:
-        kinds = {"sensors": Encoders, "drive": Drive, "track": Track, "disturbance": Disturbance}
-        for name, kind in kinds.items():
+        kinds = {
+            "sensors": (Encoders, StateSensors),
+            "drive": (Drive,),
+            "track": (Track,),
+            "disturbance": (Disturbance,),
+        }
+        for name, allowed in kinds.items():
             value = getattr(self, name)
-            if value is not None and not isinstance(value, kind):
-                raise InputError(f"Rig.{name}", value, f"a cpjax.{kind.__name__}, or None for an ideal one")
+            if value is not None and not isinstance(value, allowed):
+                names = " or ".join(f"cpjax.{kind.__name__}" for kind in allowed)
+                raise InputError(f"Rig.{name}", value, f"a {names}, or None for an ideal one")
         motor = self.plant.motor
         if self.drive is not None and self.drive.source_resistance is not None:
             if not isinstance(motor, Motor) or motor.inductance is not None:

@@ -5,6 +5,7 @@ pole's equation of motion is -l cos(theta) times the force. A random one is a fu
 number and time alone, so that no chunk, device or resumed run changes it.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -57,6 +58,7 @@ class RandomPushes:
     cart: Scalar = number("N", "magnitude of the force on the cart", default=0.0, at_least=0.0)
     pole: Scalar = number("N", "magnitude of the force on the pole", default=0.0, at_least=0.0)
     duration: Scalar = number("s", "length of each push", default=0.05, above=0.0)
+    until: Scalar = number("s", "no push after this time", default=math.inf, above=0.0, infinite=True)
 
     def __post_init__(self) -> None:
         known = not any(is_traced(value) or np.ndim(value) for value in (self.every, self.duration))
@@ -69,7 +71,7 @@ class RandomPushes:
         a, b = random_bits((key, jnp.asarray(_PUSH)), (run, interval.astype(jnp.uint32)))
         share = (a >> np.uint32(8)).astype(jnp.int32).astype(time.dtype) * 2.0**-24
         since = time - interval * self.every - share * (self.every - self.duration)
-        acts = ((since >= 0.0) & (since < self.duration)).astype(time.dtype)
+        acts = ((since >= 0.0) & (since < self.duration) & (time < self.until)).astype(time.dtype)
         side_of_cart = 1.0 - 2.0 * (b & np.uint32(1)).astype(jnp.int32).astype(time.dtype)
         side_of_pole = 1.0 - 2.0 * ((b >> np.uint32(1)) & np.uint32(1)).astype(jnp.int32).astype(time.dtype)
         return Forces(acts * side_of_cart * self.cart, acts * side_of_pole * self.pole)

@@ -1,6 +1,6 @@
 """Sensors: what the firmware measures of the plant's state."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +11,9 @@ from cpjax.numeric.quantisation import quantize
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, is_traced, number, pytree
 
+_RATES = np.uint32(1 << 16)
+"""Added to the second word of the key for the noise of the rates."""
+
 
 class Position(NamedTuple):
     """Measured positions."""
@@ -19,6 +22,37 @@ class Position(NamedTuple):
     """Cart position [m]."""
     theta: Float[Array, ""]
     """Angle of the pole from upright [rad], not wrapped."""
+
+
+@pytree
+class StateSensors:
+    """Sensors of the whole state with white noise: positions, and rates as by a tachometer and a gyroscope."""
+
+    x_noise: Scalar = number("m", "standard deviation of the noise on x", default=0.0, at_least=0.0)
+    x_dot_noise: Scalar = number("m/s", "standard deviation of the noise on x'", default=0.0, at_least=0.0)
+    theta_noise: Scalar = number("rad", "standard deviation of the noise on theta", default=0.0, at_least=0.0)
+    theta_dot_noise: Scalar = number("rad/s", "standard deviation of the noise on theta'", default=0.0, at_least=0.0)
+    theta_offset: Scalar = number("rad", "error of the angle's zero", default=0.0)
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the noise is not known to be zero."""
+        return _any_noise(self.x_noise, self.x_dot_noise, self.theta_noise, self.theta_dot_noise)
+
+    def measure(self, state: State, key: tuple[Word, Word], counter: tuple[Word, Word], *, noisy: bool = True) -> State:
+        """Returns the measurement of a state; arguments as of `Encoders.measure`."""
+        theta = state.theta + self.theta_offset
+        if not noisy:
+            return State(state.x, state.x_dot, theta, state.theta_dot)
+        dtype = jnp.asarray(state.x).dtype
+        of_x, of_theta = standard_normals(key, counter, dtype)
+        of_x_dot, of_theta_dot = standard_normals((key[0], key[1] + _RATES), counter, dtype)
+        return State(
+            state.x + self.x_noise * of_x,
+            state.x_dot + self.x_dot_noise * of_x_dot,
+            theta + self.theta_noise * of_theta,
+            state.theta_dot + self.theta_dot_noise * of_theta_dot,
+        )
 
 
 @pytree
@@ -39,7 +73,7 @@ class Encoders:
     @property
     def noisy(self) -> bool:
         """Whether the noise is not known to be zero."""
-        return any(is_traced(noise) or bool(np.any(np.asarray(noise))) for noise in (self.x_noise, self.theta_noise))
+        return _any_noise(self.x_noise, self.theta_noise)
 
     def measure(
         self, state: State, key: tuple[Word, Word], counter: tuple[Word, Word], *, noisy: bool = True
@@ -60,3 +94,11 @@ class Encoders:
             quantize(x, self.x_step, derivative="straight_through"),
             quantize(theta, self.theta_step, derivative="straight_through"),
         )
+
+
+Sensors: TypeAlias = Encoders | StateSensors
+"""What a rig may measure by."""
+
+
+def _any_noise(*deviations: Scalar) -> bool:
+    return any(is_traced(noise) or bool(np.any(np.asarray(noise))) for noise in deviations)

@@ -16,8 +16,10 @@ from cpjax.errors import InputError
 from cpjax.numeric.noise import standard_normals
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, is_traced
-from cpjax.rig import Encoders, Position, Rig
+from cpjax.rig import Position, Rig
+from cpjax.rig.sensors import Sensors
 from cpjax.sim.settings import Settings
+from cpjax.sim.switching import pick
 
 _SENSORS, _DRIVE = np.uint32(1), np.uint32(4)
 """Second words of the noise's keys; each source of noise has its own (`cpjax.rig.disturbance` has 2 and 3)."""
@@ -44,7 +46,8 @@ class Bench:
       controller: the firmware, a `Controller`.
       sensors: what it measures by; None for the whole state.
       seed: of the sensors' noise.
-      delay: updates until a command acts.
+      behind: updates until a command acts, int32, at most `delay`; None for `delay` itself.
+      delay: most updates until a command acts.
       divider: updates per control period.
       run: number of the run, which selects its noise.
       noisy: whether the sensors have noise.
@@ -52,8 +55,9 @@ class Bench:
     """
 
     controller: Any
-    sensors: Encoders | None
+    sensors: Sensors | None
     drive_noise: Any
+    behind: Any
     seed: Any
     run: Any
     delay: int
@@ -84,7 +88,8 @@ class Bench:
             normal, _ = standard_normals(key, (jnp.asarray(self.run), period), jnp.asarray(state.x).dtype)
             command = command + self.drive_noise * normal
         line = (command, *memory.line)
-        return BenchMemory(inner, memory.step + 1, line[:-1], held), line[-1]
+        acting = line[-1] if self.behind is None else pick(line, self.behind)
+        return BenchMemory(inner, memory.step + 1, line[:-1], held), acting
 
     def _measured(self, state: State, step: Int32[Array, ""]) -> Any:
         if self.sensors is None:
@@ -94,7 +99,7 @@ class Bench:
 
 
 @contextlib.contextmanager
-def _needs_rates(sensors: Encoders | None) -> Iterator[None]:
+def _needs_rates(sensors: Sensors | None) -> Iterator[None]:
     """Raises an `InputError` where a controller asks for a rate that the sensors do not measure."""
     try:
         yield
@@ -107,7 +112,7 @@ def _needs_rates(sensors: Encoders | None) -> Iterator[None]:
 
 jax.tree_util.register_dataclass(
     Bench,
-    data_fields=["controller", "sensors", "drive_noise", "seed", "run"],
+    data_fields=["controller", "sensors", "drive_noise", "behind", "seed", "run"],
     meta_fields=["delay", "divider", "noisy"],
 )
 
@@ -126,12 +131,8 @@ def on_bench(rig: Rig, controller: Any, settings: Settings, dt: float, seed: int
     Raises:
       InputError: the continuous clock with sensors or a delay, or a delay that is no whole number of steps.
     """
-    delay = 0.0 if rig.drive is None else rig.drive.delay
-    if is_traced(delay) or np.ndim(delay):
-        raise InputError("Drive.delay", delay, "one number, known when the rollout is compiled")
-    steps = round(float(delay) / dt)
-    if abs(float(delay) / dt - steps) > 1e-6 * max(1, steps):
-        raise InputError("Drive.delay", delay, f"a whole number of steps of dt = {dt:g} s")
+    delays = _steps_of_delay(rig, dt)
+    steps = int(np.max(delays))
     noise = None if rig.drive is None else rig.drive.noise
     noise = noise if noise is not None and (is_traced(noise) or bool(np.any(np.asarray(noise)))) else None
     if settings.clock == "continuous":
@@ -142,8 +143,26 @@ def on_bench(rig: Rig, controller: Any, settings: Settings, dt: float, seed: int
     if rig.sensors is None and not steps and noise is None:
         return controller, settings
     every, noisy = settings.steps_per_control, rig.sensors is not None and rig.sensors.noisy
-    if steps % every == 0:
-        return Bench(controller, rig.sensors, noise, np.uint32(seed), runs, steps // every, 1, noisy), settings
     # A delay that ends between two control instants: the bench runs at every step.
-    bench = Bench(controller, rig.sensors, noise, np.uint32(seed), runs, steps, every, noisy)
-    return bench, settings._replace(steps_per_control=1)
+    divider = 1 if np.all(delays % every == 0) else every
+    per_update = every if divider == 1 else 1
+    behind = (delays // per_update).astype(np.int32) if np.ndim(delays) else None
+    parts = (controller, rig.sensors, noise, behind, np.uint32(seed), runs)
+    bench = Bench(*parts, steps // per_update, divider, noisy)
+    return bench, settings if divider == 1 else settings._replace(steps_per_control=1)
+
+
+def _steps_of_delay(rig: Rig, dt: float) -> Any:
+    """Returns the drive's delay in steps: a whole number, or one for each run.
+
+    Raises:
+      InputError: a delay that is traced, or no whole number of steps.
+    """
+    delay = 0.0 if rig.drive is None else rig.drive.delay
+    if is_traced(delay):
+        raise InputError("Drive.delay", delay, "known when the rollout is compiled")
+    shares = np.asarray(delay, dtype=np.float64) / dt
+    steps = np.rint(shares).astype(np.int64)
+    if np.any(np.abs(shares - steps) > 1e-6 * np.maximum(1, steps)):
+        raise InputError("Drive.delay", delay, f"a whole number of steps of dt = {dt:g} s")
+    return steps

@@ -184,8 +184,9 @@ def prepared(
             rig, controller, settings, float(simulation["dt"]), simulation.get("seed", 0), runs
         )
         if controller is not bare:
-            noise = [] if controller.drive_noise is None else [np.ndim(controller.drive_noise) > 0]
-            each["controller"] += [*check("rig.sensors", rig.sensors, count), *noise, False, count is not None]
+            numbers = [one for one in (controller.drive_noise, controller.behind) if one is not None]
+            more = [np.ndim(number) > 0 for number in numbers]
+            each["controller"] += [*check("rig.sensors", rig.sensors, count), *more, False, count is not None]
     parts = (("plant", plant), ("controller", controller), ("metrics", metrics))
     plant, controller, metrics = (as_arguments(name, part, dtype) for name, part in parts)
     dt = np.asarray(simulation["dt"], dtype=dtype)
