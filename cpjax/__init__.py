@@ -45,6 +45,7 @@ from cpjax.numeric.quantisation import quantize
 from cpjax.plant import (
     HANGING,
     UPRIGHT,
+    AccelerationActuator,
     CartPole,
     ForceActuator,
     LinearModel,
@@ -74,6 +75,7 @@ __all__ = [
     "REGULATE",
     "SWING_UP",
     "UPRIGHT",
+    "AccelerationActuator",
     "AngleGate",
     "AngleRateGate",
     "CartPole",

@@ -34,7 +34,7 @@ from cpjax.controllers import (
 )
 from cpjax.errors import InputError
 from cpjax.files import dump_json, read_table, suffix_of, write_text
-from cpjax.plant import CartPole, ForceActuator, LumpedMotor, Motor
+from cpjax.plant import AccelerationActuator, CartPole, ForceActuator, LumpedMotor, Motor
 from cpjax.plant.state import State
 from cpjax.pytree import is_traced
 from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, Track, Wind
@@ -69,6 +69,7 @@ TYPES: dict[str, type] = {
         SmoothClip,
         LumpedMotor,
         ForceActuator,
+        AccelerationActuator,
         Encoders,
         Drive,
         Track,
