@@ -57,17 +57,18 @@ def model_xml(plant: CartPole | Rig, dt: float, integrator: Integrator = "RK4") 
 
     Raises:
       InputError: the class of the plant or of its motor is not cpjax's own, or the motor an `AccelerationActuator`; a
-        parameter that the model does not contain is not at its neutral value (zero unless declared); the rig's drive
-        has a delay or a dead band; a number is not concrete; dt is not positive.
+        parameter that the model does not contain is not at its neutral value (zero unless declared), of the plant, its
+        motor or the rig's drive; the rig has a disturbance; a number is not concrete; dt is not positive.
     """
     track = None
     if isinstance(plant, Rig):
         rig = plant
         require_concrete("rig", rig)
-        for name in ("delay", "dead_band"):
-            value = 0.0 if rig.drive is None else getattr(rig.drive, name)
-            if float(value) != 0.0:
-                raise InputError(f"rig.drive.{name}", value, "0; this MuJoCo model cannot express any other")
+        for name, rule in unexpressed(rig.drive).items():
+            allowed = f"{rule.neutral:g} [{rule.unit}]; this MuJoCo model cannot express any other"
+            raise InputError(f"rig.drive.{name}", getattr(rig.drive, name), allowed)
+        if rig.disturbance is not None:
+            raise InputError("rig.disturbance", rig.disturbance, "None; this MuJoCo model cannot express any")
         plant, track = rig.plant, rig.track
     plant = concrete_plant(plant)
     motor = plant.motor

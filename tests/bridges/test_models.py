@@ -331,7 +331,8 @@ def test_a_rig_written_for_mujoco_comes_back_with_the_same_motion(tmp_path, name
         ("rig.toml", cpjax.rig("paper"), "path"),
         ("rig.xml", cpjax.rig("googol"), "plant.motor"),
         ("rig.xml", cpjax.Rig(cpjax.CartPole(), drive=cpjax.Drive(delay=0.01)), "rig.drive.delay"),
-        ("rig.xml", cpjax.Rig(cpjax.CartPole(), drive=cpjax.Drive(dead_band=0.1)), "rig.drive.dead_band"),
+        ("rig.xml", cpjax.Rig(cpjax.CartPole(), drive=cpjax.Drive(lag=0.1)), "rig.drive.lag"),
+        ("rig.xml", cpjax.Rig(cpjax.CartPole(), disturbance=cpjax.Disturbance(0.1)), "rig.disturbance"),
     ],
 )
 def test_what_mjcf_cannot_hold_is_not_written(tmp_path, path, rig, field):

@@ -122,5 +122,12 @@ def test_stops_and_a_dry_pivot_act_and_the_carts_dry_friction_is_refused():
     np.testing.assert_allclose(columns(run.state)[300], [half, 0.0, *s], atol=1e-6)
     s = swung(s, 0.1, -u)
     np.testing.assert_allclose(columns(run.state)[-1], [half - 0.5 * u * 0.1**2, -u * 0.1, *s], atol=1e-6)
+    # On a tilted rail, and under a force on the cart, the cart still does as it is told; the pole feels the tilt.
+    pushes = cpjax.Pushes(np.array([0.0]), np.array([5.0]), np.array([0.0]), duration=1.0)
+    tilted = cpjax.Rig(SERVO, disturbance=cpjax.Disturbance(0.1, pushes)).moving(0, 0)
+    (sin, cos), rates = (math.sin(0.5), math.cos(0.5)), (0.3, 0.2)
+    x_ddot, theta_ddot = tilted.accelerations((sin, cos), rates, 1.0)
+    torque = m * g * l * math.sin(0.5 - 0.1) - b * 0.2 + m * l * cos
+    assert (float(x_ddot), float(theta_ddot)) == (1.0, pytest.approx(torque / inertia, rel=1e-12))
     with pytest.raises(cpjax.InputError, match="coulomb_friction"):
         dataclasses.replace(SERVO, coulomb_friction=0.5)
