@@ -47,6 +47,7 @@ from cpjax.numeric.quantisation import quantize
 from cpjax.plant import (
     HANGING,
     UPRIGHT,
+    AccelerationActuator,
     CartPole,
     ForceActuator,
     LinearModel,
@@ -76,6 +77,7 @@ __all__ = [
     "REGULATE",
     "SWING_UP",
     "UPRIGHT",
+    "AccelerationActuator",
     "AngleGate",
     "AngleRateGate",
     "CartPole",

@@ -37,7 +37,7 @@ from cpjax.controllers import (
 )
 from cpjax.errors import InputError
 from cpjax.files import dump_json, read_table, suffix_of, write_text
-from cpjax.plant import CartPole, ForceActuator, LumpedMotor, Motor
+from cpjax.plant import AccelerationActuator, CartPole, ForceActuator, LumpedMotor, Motor
 from cpjax.plant.state import State
 from cpjax.pytree import is_traced
 from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, StateSensors, Track, Wind
@@ -72,6 +72,7 @@ TYPES: dict[str, type] = {
         SmoothClip,
         LumpedMotor,
         ForceActuator,
+        AccelerationActuator,
         Encoders,
         StateSensors,
         Drive,

@@ -169,7 +169,7 @@ SHAPED = {"Bool", "Complex", "Float", "Int", "Int32", "Num", "Real"}
 NO_ARRAY = {
     "numeric/small_matrices.py: batch_last.function": "a function of any arrays",
     "numeric/small_matrices.py: batch_last": "as above",
-    "plant/cartpole.py: CartPole.motor": "a Motor, LumpedMotor or ForceActuator",
+    "plant/cartpole.py: CartPole.motor": "a Motor, LumpedMotor, ForceActuator or AccelerationActuator",
     "plant/cartpole.py: rod.others": "numbers and a motor, by name",
     "plant/initial_states.py: sample_starts.dtype": "a dtype, in each form that NumPy takes",
     "plant/initial_states.py: check_starts.name": "an argument of a user, not known to be a text",

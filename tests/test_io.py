@@ -108,6 +108,7 @@ THINGS |= {
     "Track": RIG.track,
     "LumpedMotor": cpjax.LumpedMotor(2.0 / 3.0),
     "ForceActuator": cpjax.ForceActuator(math.inf),
+    "AccelerationActuator": cpjax.AccelerationActuator(10.0 / 3.0),
     "FilteredDerivative": cpjax.FilteredDerivative(100.0 / 3.0),
     "Observer": cpjax.Observer(PLANT, np.ones((4, 2)) / 3.0),
     "Digital": cpjax.Digital(LAW, cpjax.FilteredDerivative(30.0), dead_band=0.1),

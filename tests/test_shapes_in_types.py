@@ -54,7 +54,7 @@ def calls():
     from cpjax.linear.placement import QuadraticFactors
     from cpjax.linear.structure import Structure
     from cpjax.numeric.double_word import DoubleWord
-    from cpjax.plant import CartPole, ForceActuator, LumpedMotor, Motor, State
+    from cpjax.plant import AccelerationActuator, CartPole, ForceActuator, LumpedMotor, Motor, State
     from cpjax.plant.contact import ContactMode, in_contact
 
     # Five states and two inputs, so that no two axes of a matrix are equally long by chance.
@@ -78,7 +78,7 @@ def calls():
     memory, single, sampled = c.ModeMemory(mode), c.SingleLaw(law), c.Sampled(hybrid)
     signal = c.VoltageSignal(np.arange(3.0), np.ones(3), period)
     words, seen = jnp.arange(3, dtype=jnp.uint32), State(one, one, one, one)
-    lumped, actuator = LumpedMotor(2.0), ForceActuator()
+    lumped, actuator, servo = LumpedMotor(2.0), ForceActuator(), AccelerationActuator()
     filtered, observer = c.FilteredDerivative(10.0, period), c.Observer(plant, np.ones((4, 2)), period)
     digital = c.Digital(law, filtered)
     square = {"function": lambda h: (np.array([h, h * h]), np.array([-h, h * h])), "steps": np.array([0.4, 0.2, 0.1])}
@@ -228,6 +228,13 @@ def calls():
         "plant.motor.ForceActuator.damping": call(actuator),
         "plant.motor.ForceActuator.reflected_mass": call(actuator),
         "plant.motor.ForceActuator.voltage_limit": call(actuator),
+        "plant.motor.AccelerationActuator.saturate": call(servo, jnp.ones(3)),
+        "plant.motor.AccelerationActuator.force": call(servo, jnp.ones(3), jnp.ones(3)),
+        "plant.motor.AccelerationActuator.voltage_for_force": call(servo, 1.0, 0.1),
+        "plant.motor.AccelerationActuator.force_per_voltage": call(servo),
+        "plant.motor.AccelerationActuator.damping": call(servo),
+        "plant.motor.AccelerationActuator.reflected_mass": call(servo),
+        "plant.motor.AccelerationActuator.voltage_limit": call(servo),
         "plant.parameters.parameters_of": call(plant),
         "plant.parameters.parameter": call(plant, "gear_ratio"),
         "plant.parameters.with_parameters": call(plant, {"cart_mass": 1.1, "resistance": 2.0}),
@@ -251,6 +258,9 @@ def calls():
         "controllers.feedback.PoleFactors.poles": call(pair),
         "controllers.feedback.PoleFactors.polynomial": call(pair),
         "controllers.feedback.PoleFactors.solve": call(pair, -A[:4, :4], jnp.ones((4, 1))),
+        "controllers.feedback.StateFeedback.from_convention": call(
+            c.StateFeedback, np.ones(4), ("x", "theta", "x_dot", "theta_dot")
+        ),
         "controllers.feedback.StateFeedback.voltage": call(law, state),
         "controllers.feedback.without_design": call(hybrid),
         "controllers.gates.AngleGate.margin": call(gate, state, mode),

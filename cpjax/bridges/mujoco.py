@@ -1,15 +1,21 @@
-"""Conversion of the plant to a model in MuJoCo's XML format; MuJoCo itself is not imported."""
+"""Conversion of a plant or rig to a model in MuJoCo's XML format; MuJoCo itself is not imported."""
 
 import math
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
 
-from cpjax.bridges.known import concrete_plant, unexpressed
+from cpjax.bridges.known import concrete_plant, require_concrete, unexpressed
 from cpjax.errors import InputError
-from cpjax.plant import CartPole, Motor
+from cpjax.files import write_text
+from cpjax.plant import CartPole, ForceActuator, LumpedMotor, Motor
 from cpjax.pytree import Number
+from cpjax.rig import Rig
 
 LEAST_INERTIA = 1e-9
 """Inertia given to a point bob, as MuJoCo requires one [kg m^2]."""
+
+Integrator: TypeAlias = Literal["RK4", "Euler", "implicit", "implicitfast"]
+"""Names of MuJoCo's integrators."""
 
 _STEP = Number("s", "integration step", above=0.0)
 
@@ -21,7 +27,7 @@ _MODEL = """
   <compiler angle="radian" boundmass="0" boundinertia="0"/>
   <worldbody>
     <body name="cart">
-      <joint name="x" type="slide" axis="1 0 0" damping="{damping}" armature="{armature}"/>
+      <joint name="x" type="slide" axis="1 0 0" damping="{damping}" armature="{armature}" {range}/>
       <inertial pos="0 0 0" mass="{cart_mass}" diaginertia="1 1 1"/>
       <body name="pole">
         <joint name="theta" type="hinge" axis="0 -1 0" damping="{pivot_friction}"/>
@@ -36,32 +42,46 @@ _MODEL = """
 """
 
 
-def model_xml(
-    plant: CartPole, dt: float, integrator: Literal["RK4", "Euler", "implicit", "implicitfast"] = "RK4"
-) -> str:
-    """Returns the plant as XML for `mujoco.MjModel.from_xml_string`.
+def model_xml(plant: CartPole | Rig, dt: float, integrator: Integrator = "RK4") -> str:
+    """Returns a plant or rig as XML for `mujoco.MjModel.from_xml_string`.
 
-    Joints x and theta have cpjax's signs and units (qpos, qvel); the one control is the voltage [V], which MuJoCo clips
-    as the motor does. A point bob gets the inertia `LEAST_INERTIA`.
+    Joints x and theta have cpjax's signs and units (qpos, qvel); the one control is the voltage [V], of a
+    `ForceActuator` the force [N], which MuJoCo clips as the drive does. A point bob gets the inertia `LEAST_INERTIA`. A
+    rig's track is the range of joint x, whose ends stop the cart there; its sensors are the firmware's and not in the
+    model.
 
     Args:
-      plant: a plant with concrete numbers.
+      plant: a plant or rig with concrete numbers.
       dt: integration step [s].
       integrator: MuJoCo's name of the integrator.
 
     Raises:
-      InputError: the class of `plant` or of its motor is not cpjax's own; a parameter that the model does not contain
-        is not at its neutral value (zero unless declared); a number is not concrete; dt is not positive.
+      InputError: the class of the plant or of its motor is not cpjax's own, or the motor an `AccelerationActuator`; a
+        parameter that the model does not contain is not at its neutral value (zero unless declared), of the plant, its
+        motor or the rig's drive; the rig has a disturbance; a number is not concrete; dt is not positive.
     """
+    track = None
+    if isinstance(plant, Rig):
+        rig = plant
+        require_concrete("rig", rig)
+        for name, rule in unexpressed(rig.drive).items():
+            allowed = f"{rule.neutral:g} [{rule.unit}]; this MuJoCo model cannot express any other"
+            raise InputError(f"rig.drive.{name}", getattr(rig.drive, name), allowed)
+        if rig.disturbance is not None:
+            raise InputError("rig.disturbance", rig.disturbance, "None; this MuJoCo model cannot express any")
+        plant, track = rig.plant, rig.track
     plant = concrete_plant(plant)
     motor = plant.motor
-    for path, part, cls in (("plant", plant, CartPole), ("plant.motor", motor, Motor)):
-        if type(part) is not cls:
-            raise InputError(path, part, f"a cpjax.{cls.__name__}; this MuJoCo model cannot express any other class")
-        for name, rule in unexpressed(part).items():
+    for path, part, classes in (("plant", plant, (CartPole,)), ("plant.motor", motor, _DRIVES)):
+        if type(part) not in classes:
+            names = " or ".join(f"cpjax.{cls.__name__}" for cls in classes)
+            raise InputError(path, part, f"a {names}; this MuJoCo model cannot express any other class")
+    for path, part in (("plant", plant), ("plant.motor", motor)):
+        for name, rule in unexpressed(part).items() if type(part) in (CartPole, Motor) else ():
             allowed = f"{rule.neutral:g} [{rule.unit}]; this MuJoCo model cannot express any other"
             raise InputError(f"{path}.{name}", getattr(part, name), allowed)
-    turns = motor.gear_ratio / motor.wheel_radius  # rotor angle per cart travel [rad/m]
+    armature, damping, gear = _at_the_cart(motor)
+    limit = float(motor.voltage_limit)
     numbers: dict[str, object] = {
         "dt": float(_STEP.normalise("dt", dt)),
         "gravity": plant.gravity,
@@ -70,11 +90,42 @@ def model_xml(
         "pole_length": plant.pole_length,
         "inertia": max(plant.pole_inertia, LEAST_INERTIA),
         "pivot_friction": plant.pivot_friction,
-        "armature": motor.rotor_inertia * turns**2,
-        "damping": plant.cart_friction
-        + turns**2 * (motor.viscous_friction + motor.torque_constant * motor.back_emf_constant / motor.resistance),
-        "gear": turns * motor.torque_constant / motor.resistance,
+        "armature": armature,
+        "damping": plant.cart_friction + damping,
+        "gear": gear,
+        "limits": f'ctrllimited="true" ctrlrange="-{limit} {limit}"' if math.isfinite(limit) else "",
+        "range": "" if track is None else f'limited="true" range="-{track.half_length} {track.half_length}"',
     }
-    limit = float(motor.voltage_limit)
-    limits = f'ctrllimited="true" ctrlrange="-{limit} {limit}"' if math.isfinite(limit) else ""
-    return _MODEL.format(integrator=integrator, limits=limits, **numbers)
+    return _MODEL.format(integrator=integrator, **numbers)
+
+
+def save_mjcf(path: str | Path, rig: CartPole | Rig, *, dt: float = 0.002, integrator: Integrator = "RK4") -> None:
+    """Writes a plant or rig as an MJCF file; see `model_xml`. `cpjax.bridges.models.load_model` reads it.
+
+    Args:
+      path: a file name that ends in .xml.
+      rig: a plant or rig with concrete numbers.
+      dt: integration step [s].
+      integrator: MuJoCo's name of the integrator.
+
+    Raises:
+      InputError: as for `model_xml`; another extension, or a path that cannot be written.
+    """
+    if not isinstance(path, (str, Path)) or Path(path).suffix.lower() != ".xml":
+        raise InputError("path", path, "a file name that ends in .xml")
+    write_text(Path(path), model_xml(rig, dt, integrator).lstrip())
+
+
+_DRIVES = (Motor, LumpedMotor, ForceActuator)
+
+
+def _at_the_cart(motor: Any) -> tuple[Any, Any, Any]:
+    """Returns a drive's mass [kg] and damping [N s/m] at the cart, and its force per command [N/V]."""
+    if type(motor) is not Motor:
+        return float(motor.reflected_mass), float(motor.damping), float(motor.force_per_voltage)
+    turns = motor.gear_ratio / motor.wheel_radius  # rotor angle per cart travel [rad/m]
+    return (
+        motor.rotor_inertia * turns**2,
+        turns**2 * (motor.viscous_friction + motor.torque_constant * motor.back_emf_constant / motor.resistance),
+        turns * motor.torque_constant / motor.resistance,
+    )

@@ -15,7 +15,7 @@ from cpjax.linear.lqr import lqr
 from cpjax.linear.lyapunov import lyapunov
 from cpjax.linear.placement import QuadraticFactors, place_polynomial
 from cpjax.plant.state import NAMES, UPRIGHT, State, checked_reference, deviation
-from cpjax.pytree import JaxOrNumpy, Scalars, is_traced, matrix, number, part, pytree
+from cpjax.pytree import JaxOrNumpy, Scalars, is_traced, matrix, number, part, pytree, rules
 
 
 class Designed(NamedTuple):
@@ -116,6 +116,46 @@ class StateFeedback:
         object.__setattr__(self, "reference", checked_reference("StateFeedback.reference", self.reference))
         if self.design is not None and not hasattr(self.design, "solve"):
             raise InputError("StateFeedback.design", self.design, "LqrWeights, PoleFactors, or None")
+
+    @classmethod
+    def from_convention(
+        cls,
+        K: Num[ArrayLike, "4"] | Num[ArrayLike, "1 4"] | Sequence[float],
+        order: Sequence[str] = NAMES,
+        *,
+        theta_sign: int = 1,
+        x_sign: int = 1,
+        command_sign: int | None = None,
+    ) -> "StateFeedback":
+        """Builds the law of a gain that was made for another order or other signs of the state.
+
+        Here theta = 0 is upright, a positive theta leans towards negative x, and u = -K s; a gain of u = K s changes
+        sign first. Where a positive angle leans towards positive x, `theta_sign` is -1.
+
+        Args:
+          K: the gain of the other convention, u = -K s [its command per unit of its state], in SI units and radians.
+          order: names of the states in the order of K's columns: x, x_dot, theta and theta_dot.
+          theta_sign: 1, or -1 where its angle has the opposite sign.
+          x_sign: 1, or -1 where its cart position has the opposite sign.
+          command_sign: 1, or -1 where its command has the opposite sign; `x_sign` by default, so that a positive
+            command pushes the cart towards its own positive x.
+
+        Returns:
+          The law, whose K has the order and the signs of `State`.
+
+        Raises:
+          InputError: a K that is not four finite numbers, an order that does not have each name once, another sign.
+        """
+        command_sign = x_sign if command_sign is None else command_sign
+        for name, sign in (("theta_sign", theta_sign), ("x_sign", x_sign), ("command_sign", command_sign)):
+            if isinstance(sign, bool) or not isinstance(sign, (int, float)) or sign not in (-1, 1):
+                raise InputError(name, sign, "1 or -1")
+        if not isinstance(order, (list, tuple)) or len(order) != 4 or any(name not in order for name in NAMES):
+            raise InputError("order", order, "a list with each of " + ", ".join(NAMES) + " once")
+        signs = {"x": x_sign, "x_dot": x_sign, "theta": theta_sign, "theta_dot": theta_sign}
+        given: Any = rules(cls)["K"].normalise("K", K)  # an array of shape (1, 4)
+        columns = [order.index(name) for name in NAMES]
+        return cls(given[..., columns] * np.array([command_sign * signs[name] for name in NAMES], dtype=given.dtype))
 
     def voltage(self, state: State) -> Scalars:
         """Returns the demanded voltage [V]."""

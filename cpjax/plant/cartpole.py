@@ -10,7 +10,8 @@ gives (paper, section III, with its sign error corrected; see docs/paper.md)
     (M + m) x'' - m l cos(th) th'' = F - c x' - m l sin(th) th'^2
     (J + m l^2) th'' - m l cos(th) x'' = m g l sin(th) - b th'
 
-`CartPole.acceleration` is the only place that solves these for x'' and th''.
+`CartPole.acceleration` is the only place that solves these for x'' and th''. Under an `AccelerationActuator` x'' is
+given, and the second equation alone determines th''.
 """
 
 import math
@@ -21,7 +22,8 @@ from jaxtyping import Array, Bool
 
 from cpjax.backend.trigonometry import LARGEST_TURN, rotate_by, sin_cos
 from cpjax.checks import call, real
-from cpjax.plant.motor import Motor
+from cpjax.errors import InputError
+from cpjax.plant.motor import AccelerationActuator, Motor
 from cpjax.plant.state import ANGLE_LIMIT, NAMES, RUNAWAY_LIMIT, UNITS, State
 from cpjax.pytree import Number, Scalar, Scalars, number, part, pytree
 
@@ -87,7 +89,11 @@ class CartPole:
         "1", "static per sliding dry friction", default=1.0, at_least=1.0, linear=False, neutral=1.0
     )
     motor: Any = part(
-        "a cpjax.Motor, LumpedMotor or ForceActuator", "saturate", "force", "reflected_mass", default_factory=Motor
+        "a cpjax.Motor, LumpedMotor, ForceActuator or AccelerationActuator",
+        "saturate",
+        "force",
+        "reflected_mass",
+        default_factory=Motor,
     )
 
     def __post_init__(self) -> None:
@@ -95,6 +101,9 @@ class CartPole:
             value = getattr(self, name)
             if isinstance(value, float) and value == 0.0:  # no dry friction, which costs nothing
                 object.__setattr__(self, name, None)
+        if isinstance(self.motor, AccelerationActuator) and self.coulomb_friction is not None:
+            allowed = "None with an AccelerationActuator, whose cart follows its command"
+            raise InputError("CartPole.coulomb_friction", self.coulomb_friction, allowed)
 
     @classmethod
     def rod(cls, *, mass: Scalars, length: Scalars, **others: Any) -> "CartPole":
@@ -187,12 +196,14 @@ class CartPole:
           sin: sine of theta.
           cos: cosine of theta.
           rates: `(x_dot, theta_dot)` [m/s, rad/s].
-          force: horizontal force of the wheels on the cart [N].
+          force: horizontal force of the wheels on the cart [N]; of an `AccelerationActuator` the acceleration [m/s^2].
         """
         x_dot, theta_dot = rates
         ml = self.pole_mass * self.pole_length
         push = force - self.cart_friction * x_dot - ml * theta_dot * theta_dot * sin
         torque = ml * self.gravity * sin - self.pivot_friction * theta_dot
+        if isinstance(self.motor, AccelerationActuator):  # decided while JAX traces
+            push = force
         return self.solved(sin, cos, push, torque)
 
     def solved(self, sin: Scalars, cos: Scalars, push: Scalars, torque: Scalars) -> tuple[Scalars, Scalars]:
@@ -201,11 +212,14 @@ class CartPole:
         Args:
           sin: sine of theta.
           cos: cosine of theta.
-          push: right-hand side of the cart's equation, but for the pole's acceleration [N].
+          push: right-hand side of the cart's equation, but for the pole's acceleration [N];
+            of an `AccelerationActuator` its acceleration [m/s^2].
           torque: right-hand side of the pole's, but for the cart's acceleration [N m].
         """
         m, inertia = self.pole_mass, self.pivot_inertia
         ml = m * self.pole_length
+        if isinstance(self.motor, AccelerationActuator):
+            return push, (ml * cos * push + torque) * (1.0 / inertia)
         # (M + m)(J + m l^2) - (m l cos)^2, written as a sum of positive terms so that nothing cancels
         determinant = (self.moving_mass + m) * self.pole_inertia + ml * self.pole_length * (
             self.moving_mass + m * sin * sin
@@ -223,7 +237,12 @@ class CartPole:
         return State(state.x_dot, x_ddot, state.theta_dot, theta_ddot)
 
     def force_for_acceleration(self, state: State, x_ddot: Scalars) -> Scalars:
-        """Returns the wheel force [N] under which the cart accelerates with `x_ddot` [m/s^2] (inverse dynamics)."""
+        """Returns the wheel force [N] under which the cart accelerates with `x_ddot` [m/s^2] (inverse dynamics).
+
+        Of an `AccelerationActuator`, whose `force` is the acceleration, it is `x_ddot` itself.
+        """
+        if isinstance(self.motor, AccelerationActuator):
+            return x_ddot
         sin, cos = sin_cos(state.theta)
         ml = self.pole_mass * self.pole_length
         torque = ml * self.gravity * sin - self.pivot_friction * state.theta_dot

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from cpjax.plant.cartpole import CartPole, Pair
+from cpjax.plant.motor import AccelerationActuator
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, part, pytree
 
@@ -195,7 +196,7 @@ class InContact:
         free = self.free
         x_ddot, theta_ddot, *others = free.accelerations(geometry, v, u)  # whatever forces the plant has
         coupling = self._coupling(geometry)
-        push = (free.moving_mass + free.pole_mass) * x_ddot - coupling * theta_ddot
+        push = x_ddot if self._follows else (free.moving_mass + free.pole_mass) * x_ddot - coupling * theta_ddot
         torque = free.pivot_inertia * theta_ddot - coupling * x_ddot
         push, torque = jnp.asarray(push), jnp.asarray(torque)
         if free.coulomb_friction is not None:
@@ -205,6 +206,11 @@ class InContact:
             torque = torque - mode.pole.astype(torque.dtype) * free.pivot_coulomb_friction
         return (push, torque, *others)
 
+    @property
+    def _follows(self) -> bool:
+        """Whether the cart follows a given acceleration, which then stands in the place of the force on it."""
+        return isinstance(self.free.motor, AccelerationActuator)
+
     def _coupling(self, geometry: Pair) -> Scalar:
         """Returns m l cos(theta) [kg m]."""
         return self.free.pole_mass * self.free.pole_length * geometry[1]
@@ -212,7 +218,8 @@ class InContact:
     def _one_at_rest(self, push: Scalar, torque: Scalar) -> Pair:
         """Returns x'' with the pole at rest, and theta'' with the cart at rest."""
         free = self.free
-        return push / (free.moving_mass + free.pole_mass), torque / free.pivot_inertia
+        alone = push if self._follows else push / (free.moving_mass + free.pole_mass)
+        return alone, torque / free.pivot_inertia
 
     def _forces(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
         """Returns the force [N] and the torque [N m] that would move cart and pole from rest, friction apart."""
@@ -221,7 +228,7 @@ class InContact:
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)
         return (
-            push + coupling * jnp.where(held, 0.0, alone_theta),
+            push if self._follows else push + coupling * jnp.where(held, 0.0, alone_theta),
             torque + coupling * jnp.where(resting, 0.0, alone_x),
         )
 

@@ -1,4 +1,4 @@
-"""Drives of the cart: a DC motor with gear and wheel, its lumped form, and a force."""
+"""Drives of the cart: a DC motor with gear and wheel, its lumped form, a force, and an acceleration."""
 
 from typing import Any
 
@@ -157,4 +157,48 @@ class ForceActuator:
 
     def voltage_for_force(self, force: Scalars, x_dot: Scalars) -> Scalars:
         """Returns the command for a force [N], the force itself."""
+        return force
+
+
+@pytree
+class AccelerationActuator:
+    """A drive that prescribes the cart's acceleration: the command is x'' [m/s^2], and "voltage" means it.
+
+    Servo and stepper drives with a fast inner loop are modelled like this: the cart follows whatever the pole's force
+    on it is, so that the cart's mass and friction have no effect. Where other drives have a force on the cart, this one
+    has the acceleration: `CartPole.acceleration` takes it and `CartPole.force_for_acceleration` returns it.
+    """
+
+    limit: Scalars = number("m/s^2", "|x''| is clipped here", default=10.0, above=0.0, infinite=True, linear=False)
+
+    @property
+    def voltage_limit(self) -> Scalars:
+        """The limit of the command [m/s^2]."""
+        return self.limit
+
+    @property
+    def reflected_mass(self) -> float:
+        """Mass that the drive adds to the cart: none."""
+        return 0.0
+
+    @property
+    def damping(self) -> float:
+        """Damping that the drive adds to the cart: none."""
+        return 0.0
+
+    @property
+    def force_per_voltage(self) -> float:
+        """Acceleration per command: 1."""
+        return 1.0
+
+    def saturate(self, command: Scalars) -> Float[Array, "*batch"]:
+        """Clips the commanded acceleration [m/s^2]; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
+        return jnp.maximum(-self.limit, jnp.minimum(self.limit, command))
+
+    def force(self, command: Scalars, x_dot: Scalars) -> Scalars:
+        """Returns the cart's acceleration [m/s^2], the command itself, in the place of a force."""
+        return command
+
+    def voltage_for_force(self, force: Scalars, x_dot: Scalars) -> Scalars:
+        """Returns the command for an acceleration [m/s^2] in the place of a force, the acceleration itself."""
         return force

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from cpjax.errors import InputError
 from cpjax.numeric.noise import Word, random_bits, standard_normals
+from cpjax.plant import AccelerationActuator
 from cpjax.pytree import JaxOrNumpy, Scalar, is_traced, matrix, number, pytree
 
 _PUSH, _WIND = np.uint32(2), np.uint32(3)
@@ -155,5 +156,7 @@ def loads(plant: Any, tilt: Scalar, geometry: tuple[Scalar, Scalar], forces: For
     weight = plant.pole_mass * plant.gravity * plant.pole_length
     along, lost = jnp.sin(tilt), jnp.cos(tilt) - 1.0
     push = (plant.cart_mass + plant.pole_mass) * plant.gravity * along + forces.cart + forces.pole
+    if isinstance(plant.motor, AccelerationActuator):  # its cart follows the command under any force
+        push = 0.0 * push
     torque = weight * (lost * sin - along * cos) - plant.pole_length * cos * forces.pole
     return push, torque

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, Motor
-from cpjax.plant.motor import ForceActuator, LumpedMotor
+from cpjax.plant.motor import AccelerationActuator, ForceActuator, LumpedMotor
 from cpjax.rig.bench import Rig
 from cpjax.rig.sensors import Encoders
 from cpjax.rig.track import Track
@@ -92,6 +92,58 @@ def _fileexchange() -> Rig:
     return Rig(plant)
 
 
+def _capsule(mass: float, radius: float, length: float) -> float:
+    """Returns the inertia of a solid capsule about its centre, across its axis [kg m^2]; `length` without the caps."""
+    cylinder, ball = length, 4.0 * radius / 3.0  # volumes over pi radius^2
+    about = cylinder * (length**2 / 12 + radius**2 / 4) + ball * (
+        2 * radius**2 / 5 + length**2 / 4 + 3 * length * radius / 8
+    )
+    return mass * about / (cylinder + ball)
+
+
+def _dm_control() -> Rig:
+    plant = CartPole(
+        cart_mass=1.0,
+        pole_mass=0.1,
+        pole_length=0.5,
+        pole_inertia=_capsule(0.1, radius=0.045, length=1.0),
+        cart_friction=5e-4,
+        pivot_friction=2e-6,
+        motor=LumpedMotor(force_per_voltage=10.0, voltage_limit=1.0),
+    )
+    return Rig(plant, track=Track(half_length=1.8))
+
+
+def _gymnasium() -> Rig:
+    def mass(radius: float, length: float) -> float:  # of a capsule of 1000 kg/m^3
+        return 1000.0 * math.pi * radius**2 * (length + 4.0 * radius / 3.0)
+
+    length = math.hypot(0.6, 0.001)
+    pole = mass(0.049, length)
+    plant = CartPole(
+        cart_mass=mass(0.1, 0.2),
+        pole_mass=pole,
+        pole_length=length / 2,
+        pole_inertia=_capsule(pole, radius=0.049, length=length),
+        cart_friction=1.0,
+        pivot_friction=1.0,
+        motor=LumpedMotor(force_per_voltage=100.0, voltage_limit=3.0),
+    )
+    return Rig(plant, track=Track(half_length=1.0))
+
+
+def _googol() -> Rig:
+    plant = CartPole(
+        cart_mass=1.096,
+        pole_mass=0.109,
+        pole_length=0.25,
+        pole_inertia=0.109 * 0.25**2 / 3.0,
+        gravity=9.8,
+        motor=AccelerationActuator(limit=10.0),
+    )
+    return Rig(plant, track=Track(half_length=0.25))
+
+
 PRESETS: Mapping[str, Preset] = {
     "paper": Preset(_paper, "the student paper's appendix", 0.002, "no sensors, delay or track are stated"),
     "quanser-ip02-long": Preset(
@@ -120,6 +172,27 @@ PRESETS: Mapping[str, Preset] = {
         "the command is a force without a limit",
     ),
     "fileexchange-97182": Preset(_fileexchange, "MathWorks File Exchange 97182", 0.01, "no track is stated"),
+    "dm-control": Preset(
+        _dm_control,
+        "dm_control (Apache-2.0 licence), suite/cartpole.xml",
+        0.01,
+        "the command is the action, -1 to 1, of 10 N each; there a positive angle leans towards positive x",
+    ),
+    "gymnasium": Preset(
+        _gymnasium,
+        "Gymnasium (MIT licence), envs/mujoco/assets/inverted_pendulum.xml",
+        0.04,
+        "the command is the action, -3 to 3, of 100 N each, held for two steps of 0.02 s; there a positive angle leans "
+        "towards positive x, and angle 0 leans by 1.7 mrad",
+    ),
+    "googol": Preset(
+        _googol,
+        "Googol Technology's linear inverted pendulum, course files: theta'' = 29.4 theta + 3 x''",
+        0.005,
+        "the command is the cart's acceleration, so that its mass and friction have no effect; tracks of 0.25 to 0.5 m "
+        "are stated, no control period (5 ms is taken); 29.4 and 3 follow from the inertia of a uniform "
+        "rod, not from the 0.0034 kg m^2 that are stated too",
+    ),
 }
 """Public rigs by name."""
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from cpjax.controllers import EnergySwingUp, Hybrid, LqrWeights, LyapunovGate, PoleFactors, StateFeedback
 from cpjax.errors import InputError
-from cpjax.plant import CartPole, linearize
+from cpjax.plant import AccelerationActuator, CartPole, linearize
 from cpjax.pytree import Number, rules
 
 Vector: TypeAlias = Float[Array, " parameters"]
@@ -232,7 +232,8 @@ def _natural(controller: Hybrid) -> _Natural:
     rate = math.sqrt(weight / float(plant.pivot_inertia))
     limit = float(plant.motor.voltage_limit)
     voltage = limit if math.isfinite(limit) else 12.0
-    push = abs(float(plant.motor.force_per_voltage)) * voltage / float(plant.moving_mass)
+    mass = 1.0 if isinstance(plant.motor, AccelerationActuator) else float(plant.moving_mass)
+    push = abs(float(plant.motor.force_per_voltage)) * voltage / mass
     length = float(plant.pole_length)
     per = (voltage / length, voltage / (length * rate), voltage, voltage / rate)
     design = regulator.design
