@@ -44,6 +44,12 @@ def call(*arguments, **options):
     return arguments, options
 
 
+def reference_file():
+    path = Path(tempfile.mkdtemp()) / "reference.csv"
+    path.write_text("time,x\n0.0,0.1\n")
+    return path
+
+
 def calls():
     """Valid arguments by dotted name; a method's first one is its object, if any."""
     import jax.numpy as jnp
@@ -56,6 +62,7 @@ def calls():
     from cpjax.numeric.double_word import DoubleWord
     from cpjax.plant import AccelerationActuator, CartPole, ForceActuator, LumpedMotor, Motor, State
     from cpjax.plant.contact import ContactMode, in_contact
+    from cpjax.rig import Disturbance, Rig, Wind
 
     # Five states and two inputs, so that no two axes of a matrix are equally long by chance.
     A = jnp.diag(-jnp.arange(1.0, 6.0)) + jnp.diag(jnp.full(4, 0.3), 1)
@@ -81,6 +88,9 @@ def calls():
     lumped, actuator, servo = LumpedMotor(2.0), ForceActuator(), AccelerationActuator()
     filtered, observer = c.FilteredDerivative(10.0, period), c.Observer(plant, np.ones((4, 2)), period)
     digital = c.Digital(law, filtered)
+    integral, following = c.IntegralAction(law, 1.0, period=period), c.MovingReference(law, signal)
+    pushed = Rig(CartPole(coulomb_friction=1.0), disturbance=Disturbance(wind=Wind(1.0)))
+    moving = pushed.moving(np.uint32(0), np.uint32(0))
     square = {"function": lambda h: (np.array([h, h * h]), np.array([-h, h * h])), "steps": np.array([0.4, 0.2, 0.1])}
     costs = np.array([[1.0, 3.0], [2.0, 2.0], [3.0, 3.0]])
     return {
@@ -201,6 +211,22 @@ def calls():
         "plant.contact.InContact.start_mode": call(touching, (0.1, 0.2), (0.3, 0.4)),
         "plant.contact.InContact.guards": call(touching, (0.1, 0.2), (0.3, 0.4), 1.0, contact),
         "plant.contact.InContact.jump": call(touching, (0.1, 0.2), (0.3, 0.4), contact, jnp.asarray(0, jnp.int32)),
+        "plant.contact.InContact.during": call(moving, moving.start_drive(state), mode, 0.01, state, 1.0),
+        "controllers.tracking.IntegralAction.designed": call(
+            c.IntegralAction, hybrid, plant, np.eye(4), 1.0, integral_weight=1.0
+        ),
+        "controllers.tracking.IntegralAction.at_period": call(integral, period),
+        "controllers.tracking.IntegralAction.init": call(integral, seen),
+        "controllers.tracking.IntegralAction.update": call(integral, integral.init(seen), seen),
+        "controllers.tracking.MovingReference.steps": call(
+            c.MovingReference, law, np.arange(3.0), np.ones(3)
+        ),
+        "controllers.tracking.MovingReference.square_wave": call(
+            c.MovingReference, law, amplitude=0.1, period=1.0, duration=2.0
+        ),
+        "controllers.tracking.MovingReference.from_file": call(c.MovingReference, law, reference_file()),
+        "controllers.tracking.MovingReference.init": call(following, seen),
+        "controllers.tracking.MovingReference.update": call(following, following.init(seen), seen),
         "plant.contact.InContact.release": call(touching, (0.1, 0.2), (0.3, 0.4), 1.0, contact),
         "plant.cartpole.CartPole.force_for_acceleration": call(plant, state, 1.0),
         "plant.cartpole.CartPole.kinetic_energy": call(plant, state),

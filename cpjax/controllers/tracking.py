@@ -188,7 +188,7 @@ class MovingReference:
                     raise InputError(f"{path}: line {number_of_row}: {name}", row.get(name), allowed) from problem
         if not rows:
             raise InputError("path", str(path), "a CSV file with at least one row below its header time,x")
-        return cls.steps(controller, columns["time"], columns["x"])
+        return cls.steps(controller, np.asarray(columns["time"]), np.asarray(columns["x"]))
 
     def init(self, measurement: State) -> ReferenceMemory:
         """Returns the memory before the first update."""

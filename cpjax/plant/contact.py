@@ -18,7 +18,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from cpjax.plant.cartpole import CartPole, Pair
 from cpjax.plant.motor import AccelerationActuator
@@ -46,7 +46,7 @@ class ContactMode(NamedTuple):
 class InContact:
     """A `CartPole` with dry friction, stops or both, as the loop integrates it: a `cpjax.sim.plants.Eventful` plant."""
 
-    free: CartPole = part("a cpjax.CartPole", "accelerations", "solved")
+    free: Any = part("a cpjax.CartPole, bare or on the bench", "accelerations", "solved")
     half_length: Scalar | None = None
     """Stops at this distance from the middle [m]; None for no stops."""
     restitution: Scalar = 0.0
@@ -91,7 +91,7 @@ class InContact:
 
     def accelerations(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
         """Returns (x'', theta'') [m/s^2, rad/s^2] in the mode; exactly 0 for what is held."""
-        push, torque, *others = self._loads(geometry, v, u, mode)
+        push, torque, others = self._loads(geometry, v, u, mode)
         x_ddot, theta_ddot = self.free.solved(geometry[0], geometry[1], push, torque)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)
@@ -191,8 +191,11 @@ class InContact:
         """Returns whether the cart and whether the pole is at rest."""
         return (mode.cart == HELD) | (jnp.abs(mode.cart) == AT_STOP), mode.pole == HELD
 
-    def _loads(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
-        """Returns force on the cart [N] and torque on the pole [N m], with the friction of what slides."""
+    def _loads(
+        self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode
+    ) -> tuple[Float[Array, ""], Float[Array, ""], Any]:
+        """Returns force on the cart [N] and torque on the pole [N m], with the friction of what slides, and the
+        accelerations of further coordinates."""
         free = self.free
         x_ddot, theta_ddot, *others = free.accelerations(geometry, v, u)  # whatever forces the plant has
         coupling = self._coupling(geometry)
@@ -204,7 +207,7 @@ class InContact:
             push = push - direction * free.coulomb_friction
         if free.pivot_coulomb_friction is not None:
             torque = torque - mode.pole.astype(torque.dtype) * free.pivot_coulomb_friction
-        return (push, torque, *others)
+        return push, torque, others
 
     @property
     def _follows(self) -> bool:
@@ -223,7 +226,7 @@ class InContact:
 
     def _forces(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
         """Returns the force [N] and the torque [N m] that would move cart and pole from rest, friction apart."""
-        push, torque, *_ = self._loads(geometry, v, u, mode)
+        push, torque, _ = self._loads(geometry, v, u, mode)
         coupling = self._coupling(geometry)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)

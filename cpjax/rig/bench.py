@@ -37,10 +37,10 @@ class Rig:
             "track": (Track,),
             "disturbance": (Disturbance,),
         }
-        for name, allowed in kinds.items():
+        for name, classes in kinds.items():
             value = getattr(self, name)
-            if value is not None and not isinstance(value, allowed):
-                names = " or ".join(f"cpjax.{kind.__name__}" for kind in allowed)
+            if value is not None and not isinstance(value, classes):
+                names = " or ".join(f"cpjax.{kind.__name__}" for kind in classes)
                 raise InputError(f"Rig.{name}", value, f"a {names}, or None for an ideal one")
         motor = self.plant.motor
         if self.drive is not None and self.drive.source_resistance is not None:

@@ -19,11 +19,11 @@ from cpjax.rig.drive import Drive, line_of_decay
 from cpjax.rig.track import Track
 
 Coordinates = tuple[Scalar, ...]
-"""Of cart and pole and, where the voltage changes within a step, time since its beginning."""
+"""Cart and pole and, where the voltage changes within a step, time since its beginning."""
 
 
 class DriveMemory(NamedTuple):
-    """What the drive remembers from step to step."""
+    """Memory of the drive between steps."""
 
     voltage: Float[Array, ""]
     """Terminal voltage [V]; it follows the command with the drive's lag."""
@@ -109,11 +109,11 @@ class ChangingBench(OnTheBench):
     """A rig whose forces or voltage differ from step to step: a `cpjax.sim.plants.Stepped` plant."""
 
     seed: Scalar = 0
-    """Of what is random, uint32."""
+    """Seed of what is random, uint32."""
     run: Scalar = 0
     """Number of the run, uint32."""
     forces: Forces | None = None
-    """Of pushes and wind in the present step."""
+    """Forces of pushes and wind in the present step."""
     line: Line | None = None
     """Voltage in the present step, if it changes there: terminal voltage or, with inductance, current times resistance.
     """
@@ -179,7 +179,9 @@ class ChangingBench(OnTheBench):
             now = dataclasses.replace(now, forces=self.disturbance.forces(time, key, run))
         if not self.voltage_changes:
             return now, memory
-        value, slope, voltage = jnp.asarray(u), jnp.zeros_like(jnp.asarray(u)), memory.voltage
+        value: Any = jnp.asarray(u)
+        slope: Any = jnp.zeros_like(value)
+        voltage: Any = memory.voltage
         if self.drive.lag is not None:
             ratio = dt / self.drive.lag
             at_begin, along = line_of_decay(ratio)

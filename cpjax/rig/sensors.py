@@ -97,7 +97,7 @@ class Encoders:
 
 
 Sensors: TypeAlias = Encoders | StateSensors
-"""What a rig may measure by."""
+"""Classes of sensors that a rig may have."""
 
 
 def _any_noise(*deviations: Scalar) -> bool:

@@ -137,8 +137,8 @@ def robustness_card(
 ) -> RobustnessCard:
     """Computes the robustness card of a controller on a rig.
 
-    Runs follow the evaluation protocol for rigs: from `hanging` (the cart within a quarter of the half track, where that
-    is less than 0.1 m), 20 s or 12 natural periods of the pendulum if that is longer, settled within `target_bands`;
+    Runs follow the evaluation protocol for rigs: from `hanging` (the cart within a quarter of the half track, where
+    that is less than 0.1 m), 20 s or 12 natural periods of the pendulum if that is longer, settled within `target_bands`;
     leaving the track is failure unless it has stops.
 
     Args:
@@ -275,7 +275,11 @@ def _noisy(rig: Rig, settings: RobustnessConfig, shares: Any, each: Any) -> _Var
         x, theta = (float(step) for step in (sensors.x_step, sensors.theta_step))
         more = {"x_noise": each(values) * x, "theta_noise": each(values) * theta}
         return _Variation(
-            "measurement", "noise", "steps", values, dataclasses.replace(rig, sensors=dataclasses.replace(sensors, **more))
+            "measurement",
+            "noise",
+            "steps",
+            values,
+            dataclasses.replace(rig, sensors=dataclasses.replace(sensors, **more)),
         )
     values = settings.rate_noise * shares
     base = StateSensors() if sensors is None else sensors
