@@ -37,6 +37,11 @@ class Rig:
         return OnTheBench(self.plant, Drive() if self.drive is None else self.drive, self.track)
 
 
+def plant_of(rig: Rig | CartPole) -> CartPole:
+    """Returns the plant of a rig; a plant alone is its own."""
+    return rig.plant if isinstance(rig, Rig) else rig
+
+
 @pytree
 class OnTheBench:
     """A cart-pole with its drive and track, for the loop."""
