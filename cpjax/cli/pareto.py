@@ -66,7 +66,7 @@ def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
     rig = build_rig(sections["plant"])
-    refuse_parts(rig, "pareto")
+    refuse_parts(rig, "pareto", honoured=("track",))
     plant = plant_of(rig)
     chosen = dict(sections["front"])
     supplies = tuple(chosen.pop("supplies", SUPPLIES))
@@ -97,7 +97,7 @@ def run_pareto(
 
     Args:
       parts: folder of finished searches, from which an interrupted run goes on; removed at the end.
-      rig: the plant, or a rig of which only the plant counts.
+      rig: the plant, or a rig, of which plant and track count.
       supplies: further voltage limits for settling time against effort [V].
       notes: for the JSON.
 
@@ -109,9 +109,9 @@ def run_pareto(
     plant = plant_of(rig)
     request = {"plan": dataclasses.asdict(plan), **io.encode_bench(rig), "supplies": supplies}
     with Workspace(parts, {**request, "versions": files.versions()}) as memory:
-        measure = reference_points(plant, plan, supplies)
-        found = {design: trace_design(memory, plant, design, plan, supplies, measure) for design in DESIGNS}
-        known = known_controllers(plant, plan)
+        measure = reference_points(rig, plan, supplies)
+        found = {design: trace_design(memory, rig, design, plan, supplies, measure) for design in DESIGNS}
+        known = known_controllers(rig, plan)
         document = {
             "what": "mean settling time against mean cost, of controllers that no other found beats",
             "versions": files.versions(),
@@ -128,7 +128,7 @@ def run_pareto(
     return found, pictures
 
 
-def known_controllers(plant: CartPole, plan: FrontConfig) -> list[tuple[str, Compared]]:
+def known_controllers(rig: Rig | CartPole, plan: FrontConfig) -> list[tuple[str, Compared]]:
     """Evaluates the paper's printed gains and cpjax's presets from the initial states that measure the points."""
     from cpjax.study.fronts.evaluator import FINAL
     from cpjax.tune.descent import derive_seed
@@ -136,16 +136,17 @@ def known_controllers(plant: CartPole, plan: FrontConfig) -> list[tuple[str, Com
     setting = EvaluationConfig(
         count=plan.final, seed=derive_seed(plan.seed, FINAL, 0), duration=plan.horizon, dt=plan.final_dt
     )
+    plant = plant_of(rig)
     chosen = [one for one in entries(plant) if one.gains != "computed"]
     own = io.encode(plant) == io.encode(paper.appendix_plant())
     preset = "tuned, as shipped" if own else "as shipped for the appendix's plant"
-    compared = compare(plant, chosen, setting)[1]
+    compared = compare(rig, chosen, setting)[1]
     return [(preset if one.entry.gains == "tuned" else one.entry.name, one) for one in compared]
 
 
 def trace_design(
     memory: Workspace,
-    plant: CartPole,
+    rig: Rig | CartPole,
     design: paper.Design,
     plan: FrontConfig,
     supplies: tuple[float, ...],
@@ -161,7 +162,7 @@ def trace_design(
 
     with progress(f"pareto, {design}") as report:
         fronts = trace_fronts(
-            plant,
+            rig,
             design,
             plan,
             measure.reference,

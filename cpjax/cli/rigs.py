@@ -155,7 +155,7 @@ def with_usual_period(
 
 @dataclasses.dataclass(frozen=True)
 class Firmware:
-    """What runs on a rig around a controller, and how often; by default the controller alone."""
+    """Parts that run on a rig around a controller, and how often; by default the controller alone."""
 
     estimator: Any = None
     dead_band: float = 0.0

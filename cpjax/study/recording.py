@@ -32,7 +32,7 @@ _DIGEST, _LAYOUT = "digest", "layout"  # keys of the checksum, and of the layout
 
 def record_sweep(
     path: str | Path,
-    plant: Plant,
+    plant: Plant | Rig,
     controller: Controller | ModalController | Law,
     starts: PlantState,
     *,

@@ -24,7 +24,7 @@ _ABSENT = {
     "drive": "no drive: commands act at once, without delay or dead band",
     "track": "no track: the cart may travel any distance",
 }
-"""What it means that a part is absent, by its name."""
+"""Consequence of a part that is absent, by its name."""
 
 
 class Figure(NamedTuple):

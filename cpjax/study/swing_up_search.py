@@ -193,7 +193,7 @@ def _frequency(plant: CartPole) -> float:
     return math.sqrt(weight / float(plant.pivot_inertia))
 
 
-def _timing(plant: CartPole) -> dict[str, float]:
+def _timing(plant: CartPole) -> dict[str, Any]:
     """Returns duration and dt [s]: fine against the swings and against the fastest linear mode."""
     A, _ = linearize(plant)
     swing = 2.0 * math.pi / _frequency(plant)

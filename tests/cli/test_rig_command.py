@@ -38,6 +38,9 @@ from cpjax.pytree import numbers
 from cpjax.rig import PRESETS
 from cpjax.rig import rig as named_rig
 from cpjax.study import rig_check
+from cpjax.study.fronts import evaluator
+from cpjax.study.fronts.config import FrontConfig
+from cpjax.study.fronts.evaluator import EVALUATION, Evaluator
 from cpjax.study.rig_check import check_rig, document
 from cpjax.study.swing_up_search import search_swing_up
 
@@ -299,13 +302,26 @@ def test_commands_of_many_runs_take_the_whole_rig_and_its_firmware(command, tmp_
         assert firmware.simulation == {"control_period": 0.01, "seed": 7}
 
 
-@rows("name, ignored", [("tune", "sensors,drive"), ("pareto", "sensors,drive,track"), ("audit-gradients", "sensors")])
+@rows(
+    "name, ignored",
+    [("tune", "sensors,drive"), ("pareto", "sensors,drive"), ("audit-gradients", "sensors,drive,track")],
+)
 def test_a_command_that_would_ignore_parts_of_a_rig_refuses_it(command, tmp_path, name, ignored):
     io.save(tmp_path / "rig.json", FULL)
     result = command(name, "--rig", tmp_path / "rig.json", "--out", tmp_path / "out")
     assert (result.code, result.err.count("\n")) == (2, 1)
     assert f"--without {ignored}" in result.err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_front_counts_no_run_that_leaves_the_rigs_track(monkeypatch):
+    monkeypatch.setattr(evaluator, "_RUNS", 4)
+    monkeypatch.setattr(evaluator, "_CONTROLLERS", 1)
+    plan, plant = FrontConfig(horizon=8.0, evaluation_dt=0.01), paper.appendix_plant()
+    long, short = (Evaluator(Rig(plant, track=Track(length)), "lqr", plan) for length in (3.0, 0.12))
+    start = np.asarray(long.free.start())[None]
+    assert long.evaluate(start, 12.0, 4, EVALUATION).success[0] > 0.0
+    assert short.evaluate(start, 12.0, 4, EVALUATION).success[0] == 0.0
 
 
 def test_a_tuning_takes_the_rigs_track_for_its_goal(command, tmp_path):
