@@ -40,7 +40,7 @@ from cpjax.files import dump_json, read_table, suffix_of, write_text
 from cpjax.plant import AccelerationActuator, CartPole, ForceActuator, LumpedMotor, Motor
 from cpjax.plant.state import State
 from cpjax.pytree import is_traced
-from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, StateSensors, Track, Wind
+from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, StateSensors, Track, Wind, plant_of
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import Trajectory
 
@@ -157,8 +157,10 @@ def load(path: str | Path) -> Any:
     return _decode(table, str(path))
 
 
-def load_part(path: str | Path, key: Literal["plant", "controller"], wanted: str) -> Any:
-    """Reads a component as `load` does, or the plant or controller of a result that a command wrote.
+def load_part(path: str | Path, key: Literal["plant", "controller", "rig"], wanted: str) -> Any:
+    """Reads a component as `load` does, or the plant, controller or rig of a result that a command wrote.
+
+    A result without a rig was computed for its plant alone, which then stands for the rig.
 
     Args:
       path: a file name that ends in .json or .toml.
@@ -170,8 +172,9 @@ def load_part(path: str | Path, key: Literal["plant", "controller"], wanted: str
     """
     path = _checked_path(path)
     table = read_table(path)
-    if "type" not in table and isinstance(table.get(key), dict):
-        return _decode(table[key], f"{path}: {key}")
+    for part in ("rig", "plant") if key == "rig" else (key,):
+        if "type" not in table and isinstance(table.get(part), dict):
+            return _decode(table[part], f"{path}: {part}")
     if _known_type(table.get("type")) is None:
         raise InputError(key, str(path), f"a file that holds {wanted}; this one holds {contents(table)}")
     return load(path)
@@ -201,6 +204,11 @@ def encode(thing: Any) -> dict[str, Any]:
         fields |= fields.pop("outputs")
     given = {key: value for key, value in fields.items() if value is not None}
     return {"type": name, **{key: _encode_value(f"{name}.{key}", value) for key, value in given.items()}}
+
+
+def encode_bench(rig: Rig | CartPole) -> dict[str, Any]:
+    """Returns the entries of a result that say what ran: `plant` and, of a rig, `rig`, which holds the plant too."""
+    return {"plant": encode(plant_of(rig)), **({"rig": encode(rig)} if isinstance(rig, Rig) else {})}
 
 
 def _checked_path(path: Any) -> Path:

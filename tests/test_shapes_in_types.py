@@ -12,6 +12,8 @@ import os
 import pkgutil
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 import pytest
 
@@ -218,9 +220,7 @@ def calls():
         "controllers.tracking.IntegralAction.at_period": call(integral, period),
         "controllers.tracking.IntegralAction.init": call(integral, seen),
         "controllers.tracking.IntegralAction.update": call(integral, integral.init(seen), seen),
-        "controllers.tracking.MovingReference.steps": call(
-            c.MovingReference, law, np.arange(3.0), np.ones(3)
-        ),
+        "controllers.tracking.MovingReference.steps": call(c.MovingReference, law, np.arange(3.0), np.ones(3)),
         "controllers.tracking.MovingReference.square_wave": call(
             c.MovingReference, law, amplitude=0.1, period=1.0, duration=2.0
         ),

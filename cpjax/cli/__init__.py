@@ -40,6 +40,7 @@ _COMMANDS = (
     "basin",
     "pareto",
     "animate",
+    "rig",
     "report",
 )
 """Modules of this package, in the order in which the help lists them."""

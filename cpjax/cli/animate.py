@@ -6,19 +6,31 @@ from pathlib import Path
 from typing import Any
 
 from cpjax import files, io
-from cpjax.cli.builders import PLANT_OPTIONS, START_OPTIONS, build_plant, build_start, controller_title, named_hybrid
+from cpjax.cli.builders import PLANT_OPTIONS, START_OPTIONS, build_start, controller_title, named_hybrid
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
+from cpjax.cli.rigs import (
+    BARE,
+    FIRMWARE_OPTIONS,
+    RIG_OPTIONS,
+    Firmware,
+    build_firmware,
+    build_rig,
+    split_period,
+    with_usual_period,
+)
 from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
+from cpjax.rig import Rig, plant_of
 from cpjax.show import ANIMATION_FORMATS
 from cpjax.sim.rollout import Trajectory, rollout
 
 CONTROLLERS = ("corrected/lqr", "tuned_lqr")
+_DT = 0.002  # integration step [s]; it divides _AFTER
 _AFTER = 1.0  # simulated beyond the shown time [s]: success must hold that long
 
 OPTIONS = [
@@ -34,6 +46,8 @@ OPTIONS = [
     Option("animation", "rate", "pictures per second, for a GIF at most 50 (default 20)", float),
     *START_OPTIONS,
     *PLANT_OPTIONS,
+    *RIG_OPTIONS,
+    *FIRMWARE_OPTIONS,
 ]
 
 
@@ -51,7 +65,8 @@ def add_command(commands: Any) -> None:
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
-    plant = build_plant(sections["plant"])
+    rig = build_rig(sections["plant"])
+    plant = plant_of(rig)
     chosen = {"controllers": list(CONTROLLERS), "format": "gif", "duration": 6.0, "rate": 20.0, **sections["animation"]}
     if not 0.0 < chosen["duration"] <= 600.0:
         raise InputError("duration", chosen["duration"], "above 0 and at most 600 s")
@@ -59,10 +74,15 @@ def run(given: argparse.Namespace) -> int:
     if len(set(names)) < len(names):
         raise InputError("controllers", names, "each one once")
     controllers = {name: named_hybrid(name, plant) for name in names}
-    notes = notes_on(sections["plant"], plant, controllers)
+    stated, estimation = split_period({}, sections["firmware"])
+    setting = with_usual_period({"dt": _DT, **stated}, stated, sections["plant"])
+    firmware = build_firmware(estimation, rig, setting, given.seed)
+    notes = [*notes_on(sections["plant"], plant, controllers), *firmware.notes]
     announce("animate", notes)
     start = build_start(sections["start"], given.seed)
-    path, runs = run_animation(given.out, plant, controllers, start, chosen, seed=given.seed, notes=notes)
+    path, runs = run_animation(
+        given.out, rig, controllers, start, chosen, firmware=firmware, seed=given.seed, notes=notes
+    )
     for name, one in runs.items():
         say(f"{controller_title(name)}: {verdict(one, chosen['duration'])}")
     say(f"wrote {path} and animation.json")
@@ -71,10 +91,12 @@ def run(given: argparse.Namespace) -> int:
 
 def run_animation(
     out: Path,
-    plant: CartPole,
+    rig: Rig | CartPole,
     controllers: Mapping[str, Hybrid],
     start: State,
     chosen: Mapping[str, Any],
+    *,
+    firmware: Firmware = BARE,
     **others: Any,
 ) -> tuple[Path, dict[str, Trajectory]]:
     """Simulates the controllers and writes the animation and animation.json.
@@ -83,17 +105,16 @@ def run_animation(
       controllers: by the names that `controller_title` puts into words.
       start: the initial state of all runs.
       chosen: format (gif, mp4 or html), duration [s] and rate [pictures/s].
+      firmware: what runs around each controller.
       others: further entries of the JSON.
 
     Returns:
       The animation's file, and the runs by name.
     """
-    dt = 0.002  # divides _AFTER
-    duration = dt * round(chosen["duration"] / dt)
-    runs = {
-        name: rollout(plant, controller, start, duration=duration + _AFTER, dt=dt, clock="sampled")
-        for name, controller in controllers.items()
-    }
+    plant = plant_of(rig)
+    duration = _DT * round(chosen["duration"] / _DT)
+    how: dict[str, Any] = {"duration": duration + _AFTER, "dt": _DT, "clock": "sampled", **firmware.simulation}
+    runs = {name: rollout(rig, firmware(controller), start, **how) for name, controller in controllers.items()}
 
     from cpjax.show.animation import Scene, encoder, save_animation
 
@@ -114,7 +135,8 @@ def run_animation(
         "what": "runs shown by the animation beside this file",
         "versions": files.versions(),
         "start": io.encode(start),
-        "plant": io.encode(plant),
+        **io.encode_bench(rig),
+        **firmware.entries(),
         "file": path.name,
         "duration": duration,
         "metrics_over": duration + _AFTER,

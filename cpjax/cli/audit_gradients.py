@@ -6,20 +6,23 @@ from pathlib import Path
 from typing import Any
 
 from cpjax import files, io
-from cpjax.cli.builders import CONTROLLER_OPTIONS, PLANT_OPTIONS, build_hybrid, build_plant
+from cpjax.cli.builders import CONTROLLER_OPTIONS, PLANT_OPTIONS, build_hybrid
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import compiling, progress
+from cpjax.cli.rigs import RIG_OPTIONS, build_rig, refuse_parts
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.plant import CartPole
 from cpjax.plant.initial_states import START_SETS, sample_starts
+from cpjax.rig import Rig, plant_of
 from cpjax.study.gradient_audit import GradientAudit, audit_gradients, document
 from cpjax.study.named_parameters import parametrise
 
 OPTIONS = [
     *PLANT_OPTIONS,
+    *RIG_OPTIONS,
     *CONTROLLER_OPTIONS,
     Option("audit", "starts", "set of initial states (default hanging)", choices=START_SETS),
     Option("audit", "count", "number of initial states (default 16)", int),
@@ -43,11 +46,13 @@ def add_command(commands: Any) -> None:
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
-    plant = build_plant(sections["plant"])
+    rig = build_rig(sections["plant"])
+    refuse_parts(rig, "audit-gradients")
+    plant = plant_of(rig)
     controller = build_hybrid(sections["controller"], plant)
     notes = notes_on(sections["plant"], plant, {"the controller": controller})
     announce("audit-gradients", notes)
-    audit, _ = run_audit(given.out, plant, controller, sections["audit"], given.seed, notes)
+    audit, _ = run_audit(given.out, rig, controller, sections["audit"], given.seed, notes)
 
     from cpjax.show.gradients import TITLE, cells, findings, header
 
@@ -63,18 +68,24 @@ def run(given: argparse.Namespace) -> int:
 
 
 def run_audit(
-    out: Path, plant: CartPole, controller: Hybrid, setting: Mapping[str, Any], seed: int, notes: Sequence[str] = ()
+    out: Path,
+    rig: Rig | CartPole,
+    controller: Hybrid,
+    setting: Mapping[str, Any],
+    seed: int,
+    notes: Sequence[str] = (),
 ) -> tuple[GradientAudit, bytes]:
     """Runs the audit, writes its JSON and picture, and returns the audit and the picture.
 
     Args:
+      rig: the plant, or a rig of which only the plant counts.
       setting: starts, count, duration [s] and dt [s]; missing ones have the options' defaults.
       seed: of the initial states.
       notes: for the JSON.
     """
     setting = {"starts": "hanging", "count": 16, "duration": 4.0, "dt": 1e-3, **setting}
     starts = sample_starts(setting["starts"], setting["count"], seed=seed)
-    chosen = parametrise(plant, controller)
+    chosen = parametrise(plant_of(rig), controller)
     with progress("audit-gradients") as report:
         audit = audit_gradients(
             chosen.build,
@@ -85,7 +96,7 @@ def run_audit(
             dt=setting["dt"],
             progress=compiling(report, "located"),
         )
-    loop = {"plant": io.encode(plant), "controller": io.encode(controller), "notes": notes}
+    loop = {**io.encode_bench(rig), "controller": io.encode(controller), "notes": notes}
     described = document(audit, starts, seed=seed, setting=setting, parameters=chosen.parameters, **loop)
     files.write_json(out / "audit_gradients.json", described)
 

@@ -11,16 +11,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cpjax import files, io
-from cpjax.cli.builders import PLANT_OPTIONS, build_plant, controller_title, named_hybrid
+from cpjax.cli.builders import PLANT_OPTIONS, controller_title, named_hybrid
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
+from cpjax.cli.rigs import (
+    BARE,
+    FIRMWARE_OPTIONS,
+    RIG_OPTIONS,
+    Firmware,
+    build_firmware,
+    build_rig,
+    split_period,
+    with_usual_period,
+)
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
+from cpjax.controllers.protocol import Controller
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.plant.state import NAMES, UNITS
+from cpjax.rig import Rig, plant_of
 from cpjax.sim.metrics import Metrics
 from cpjax.study.basin import MOST_CELLS, Axis, StartGrid, area, document
 from cpjax.study.design_check import DesignCheck, check_design
@@ -58,6 +70,8 @@ OPTIONS = [
     Option("run", "duration", "length of each run [s] (default 10)", float),
     Option("run", "dt", "integration step and control period [s] (default 0.002)", float),
     *PLANT_OPTIONS,
+    *RIG_OPTIONS,
+    *FIRMWARE_OPTIONS,
 ]
 
 
@@ -75,18 +89,21 @@ def add_command(commands: Any) -> None:
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
-    plant = build_plant(sections["plant"])
+    rig = build_rig(sections["plant"])
+    plant = plant_of(rig)
     chosen = dict(sections["map"])
     names = chosen.pop("controllers", list(CONTROLLERS))
     if len({file_of(name) for name in names}) < len(names):
         raise InputError("controllers", names, "each one once, and with names that differ in more than their endings")
     controllers = {name: named_hybrid(name, plant) for name in names}
-    notes = notes_on(sections["plant"], plant, controllers)
+    stated, estimation = split_period(sections["run"], sections["firmware"])
+    setting = with_usual_period({"duration": 10.0, "dt": 0.002, **stated}, stated, sections["plant"])
+    firmware = build_firmware(estimation, rig, setting, given.seed)
+    notes = [*notes_on(sections["plant"], plant, controllers), *firmware.notes]
     announce("basin", notes)
-    setting = {"duration": 10.0, "dt": 0.002, **sections["run"]}
     begin = time.perf_counter()
     chart = chart_of(chosen, given.seed)
-    rows, _ = run_basin(given.out, given.out / "basin.parts", plant, controllers, chart, setting, notes)
+    rows, _ = run_basin(given.out, given.out / "basin.parts", rig, controllers, chart, setting, notes, firmware)
     seconds = time.perf_counter() - begin
     print_table(*table(rows), text_columns=1)
     steps = len(names) * chart.up.cells * chart.across.cells * round(setting["duration"] / setting["dt"])
@@ -98,11 +115,12 @@ def run(given: argparse.Namespace) -> int:
 def run_basin(
     out: Path,
     parts: Path,
-    plant: CartPole,
+    rig: Rig | CartPole,
     controllers: Mapping[str, Hybrid],
     chart: StartGrid,
     setting: dict[str, Any],
     notes: Sequence[str] = (),
+    firmware: Firmware = BARE,
 ) -> tuple[dict[str, dict[str, Any]], bytes]:
     """Maps all controllers and, when all are done, writes basin.json, basin.png and their runs.
 
@@ -112,8 +130,9 @@ def run_basin(
     Args:
       controllers: by the names that `controller_title` puts into words.
       chart: the grid of initial states.
-      setting: duration and dt [s].
+      setting: duration and dt [s], and perhaps control_period.
       notes: for the JSON.
+      firmware: what runs around each controller.
 
     Returns:
       Each controller's map in a few numbers, by name, and the picture.
@@ -123,17 +142,19 @@ def run_basin(
         "versions": files.versions(),
         "map": dataclasses.asdict(chart),
         "run": setting,
-        "plant": io.encode(plant),
+        **io.encode_bench(rig),
         "controllers": {name: io.encode(one) for name, one in controllers.items()},
+        **firmware.entries(),
     }
+    how = {**setting, **firmware.simulation}
     with Workspace(parts, request) as memory:
-        metrics = {name: compute_map(memory, plant, chart, name, one, setting) for name, one in controllers.items()}
+        metrics = {name: compute_map(memory, rig, chart, name, firmware(one), how) for name, one in controllers.items()}
         rows = {name: document(chart, found) for name, found in metrics.items()}
 
         from cpjax.show.basin import basins
         from cpjax.show.figures import png
 
-        panels = [panel_of(plant, chart, name, one, metrics[name]) for name, one in controllers.items()]
+        panels = [panel_of(plant_of(rig), chart, name, one, metrics[name]) for name, one in controllers.items()]
         picture = png(basins(chart, panels))
         recorded = {name: file_of(name) for name in controllers}
         for file in recorded.values():
@@ -175,7 +196,7 @@ def file_of(name: str) -> str:
 
 
 def compute_map(
-    memory: Workspace, plant: CartPole, chart: StartGrid, name: str, controller: Hybrid, setting: dict[str, Any]
+    memory: Workspace, rig: Rig | CartPole, chart: StartGrid, name: str, controller: Controller, setting: dict[str, Any]
 ) -> Metrics:
     """Returns the metrics of a controller's map, recorded in `memory` or, if complete there, read from it."""
     path = memory.folder / file_of(name)
@@ -186,7 +207,7 @@ def compute_map(
     with progress(name) as report:
         metrics: Metrics = record_sweep(
             path,
-            plant,
+            rig,
             controller,
             chart.starts(),
             **setting,

@@ -29,11 +29,12 @@ from cpjax.controllers.protocol import Controller, as_controller
 from cpjax.errors import InputError, MissingError
 from cpjax.linear.lqr import lqr
 from cpjax.linear.placement import place
-from cpjax.plant import CartPole, Motor, linearize, with_parameters
+from cpjax.plant import CartPole, ForceActuator, LumpedMotor, Motor, linearize, with_parameters
 from cpjax.plant.initial_states import START_SETS, sample_starts
 from cpjax.plant.state import NAMES, UNITS, State
 from cpjax.presets import PRESETS, preset
 from cpjax.pytree import rules
+from cpjax.rig import Rig
 from cpjax.sim.integrators import INTEGRATORS
 
 _LONG_NAME = 48  # characters of a file's name that fit above a picture
@@ -45,10 +46,23 @@ _GATES: Mapping[str, type[AngleGate | AngleRateGate | LyapunovGate]] = {
     "lyapunov": LyapunovGate,
 }
 
+_DRIVES = (Motor, LumpedMotor, ForceActuator)
+
+
+def _drive_options() -> list[Option]:
+    """Returns the options of all drives; of several that share a name, the first."""
+    found: dict[str, Option] = {}
+    for drive in _DRIVES:
+        for option in options_of("plant", drive):
+            whose = option.help if drive is Motor else f"{option.help}; of a {drive.__name__}"
+            found.setdefault(option.key, dataclasses.replace(option, help=whose))
+    return list(found.values())
+
+
 PLANT_OPTIONS = [
     Option("plant", "base", f"{_PLANTS}, or a plant's file; other options change it (default appendix)", flag="plant"),
     *options_of("plant", CartPole),
-    *options_of("plant", Motor),
+    *_drive_options(),
 ]
 
 CONTROLLER_OPTIONS = [
@@ -135,7 +149,9 @@ def build_plant(given: Mapping[str, Any]) -> CartPole:
             raise InputError("plant", base, f"{_PLANTS}, or a file that ends in .json or .toml")
         plant = io.load_part(base, "plant", "a CartPole")
         if not isinstance(plant, CartPole):
-            raise InputError("plant", base, f"a file that holds a CartPole; this one holds a {type(plant).__name__}")
+            hint = ", for --rig" if isinstance(plant, Rig) else ""
+            held = f"this one holds a {type(plant).__name__}{hint}"
+            raise InputError("plant", base, f"a file that holds a CartPole; {held}")
     return with_parameters(plant, changes)
 
 

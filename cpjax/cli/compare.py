@@ -8,11 +8,21 @@ from typing import Any
 import numpy as np
 
 from cpjax import files, io, paper
-from cpjax.cli.builders import EVALUATION_OPTIONS, PLANT_OPTIONS, build_plant, saved
+from cpjax.cli.builders import EVALUATION_OPTIONS, PLANT_OPTIONS, saved
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
+from cpjax.cli.rigs import (
+    BARE,
+    FIRMWARE_OPTIONS,
+    RIG_OPTIONS,
+    Firmware,
+    build_firmware,
+    build_rig,
+    split_period,
+    with_usual_period,
+)
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid, LqrWeights, PoleFactors
 from cpjax.errors import InputError
@@ -20,10 +30,13 @@ from cpjax.paper.comparison import Compared, Entry, best, compare, document, ent
 from cpjax.paper.reproduction import DESIGNS, EvaluationConfig
 from cpjax.plant import CartPole
 from cpjax.plant.state import NAMES, State
+from cpjax.rig import Rig, plant_of
 from cpjax.sim.rollout import rollout
 
 OPTIONS = [
     *PLANT_OPTIONS,
+    *RIG_OPTIONS,
+    *FIRMWARE_OPTIONS,
     *EVALUATION_OPTIONS,
     Option("tuned", "lqr", "a file of `cpjax tune`, instead of the one that comes with cpjax", flag="tuned-lqr"),
     Option("tuned", "placement", "the same for pole placement", flag="tuned-placement"),
@@ -45,14 +58,19 @@ def add_command(commands: Any) -> None:
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
-    plant = build_plant(sections["plant"])
+    rig = build_rig(sections["plant"])
+    plant = plant_of(rig)
     setting = EvaluationConfig(seed=given.seed, **sections["evaluation"])
+    stated, estimation = split_period(sections["evaluation"], sections["firmware"])
+    timing = with_usual_period({**stated, "dt": setting.dt}, stated, sections["plant"])
+    firmware = build_firmware(estimation, rig, timing, given.seed)
     files = dict(sections["tuned"])
     limit = files.pop("track_limit", float("inf"))
     tuned = {design: _loaded(design, files[design]) for design in DESIGNS if design in files}
     notes = notes_on(sections["plant"], plant, {_name(one): one.controller for one in entries(plant, tuned)})
+    notes += firmware.notes
     announce("compare", notes)
-    results, shown_start, _ = run_comparison(given.out, plant, setting, tuned, limit, notes)
+    results, shown_start, _ = run_comparison(given.out, rig, setting, tuned, limit, notes, firmware)
 
     from cpjax.show.comparison import findings
 
@@ -64,11 +82,12 @@ def run(given: argparse.Namespace) -> int:
 
 def run_comparison(
     out: Path,
-    plant: CartPole,
+    rig: Rig | CartPole,
     setting: EvaluationConfig,
     tuned: Mapping[paper.Design, Hybrid],
     track_limit: float = float("inf"),
     notes: Sequence[str] = (),
+    firmware: Firmware = BARE,
 ) -> tuple[list[Compared], str, dict[str, bytes]]:
     """Runs the comparison and writes its JSON and pictures.
 
@@ -76,13 +95,18 @@ def run_comparison(
       tuned: by design; the presets where it has none.
       track_limit: a run that leaves |x| <= track_limit [m] fails.
       notes: for the JSON.
+      firmware: what runs around each controller.
 
     Returns:
       The results, in words which initial state the pictures of one run show, and the pictures by name.
     """
+    plant = plant_of(rig)
     chosen = entries(plant, tuned)
+    how: dict[str, Any] = dict(firmware.simulation)
     with progress("compare") as report:
-        starts, results = compare(plant, chosen, setting, track_limit=track_limit, progress=report)
+        starts, results = compare(
+            rig, chosen, setting, track_limit=track_limit, progress=report, firmware=firmware, **how
+        )
     best_ones: dict[tuple[str, str], Compared] = {
         (kind, design): best(results, design, tuned=kind == "tuned")
         for kind in ("paper", "tuned")
@@ -90,14 +114,15 @@ def run_comparison(
     }
     start, chosen_because = representative_start(starts, list(best_ones.values()))
     shown_start = {"state": io.encode(start), "is": chosen_because}
-    described = document(plant, results, setting, track_limit=track_limit, shown_start=shown_start, notes=notes)
+    more = {"track_limit": track_limit, "shown_start": shown_start, "notes": notes, **firmware.entries()}
+    described = document(rig, results, setting, **more)
     files.write_json(out / "compare.json", described)
 
     from cpjax.show.comparison import by_start, phase_portraits, responses
     from cpjax.show.figures import save_figure
 
-    how: dict[str, Any] = {"duration": setting.duration, "dt": setting.dt, "clock": "sampled"}
-    shown = {key: (one, rollout(plant, one.entry.controller, start, **how)) for key, one in best_ones.items()}
+    how |= {"duration": setting.duration, "dt": setting.dt, "clock": "sampled"}
+    shown = {key: (one, rollout(rig, firmware(one.entry.controller), start, **how)) for key, one in best_ones.items()}
     times = [float(run.metrics.settling_time) for _, run in shown.values() if bool(run.metrics.success)]
     until = min(setting.duration, 1.1 * max(times, default=setting.duration)) or setting.duration
     title = f"start {chosen_because}"

@@ -4,14 +4,16 @@ import argparse
 from typing import Any
 
 from cpjax import files, io
-from cpjax.cli.builders import CONTROLLER_OPTIONS, PLANT_OPTIONS, build_hybrid, build_plant
+from cpjax.cli.builders import CONTROLLER_OPTIONS, PLANT_OPTIONS, build_hybrid
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import add_options, resolve
 from cpjax.cli.output import say
+from cpjax.cli.rigs import RIG_OPTIONS, build_rig, parts_of
 from cpjax.cli.tables import print_table
+from cpjax.rig import plant_of
 from cpjax.study.design_check import check_design, document
 
-OPTIONS = [*PLANT_OPTIONS, *CONTROLLER_OPTIONS]
+OPTIONS = [*PLANT_OPTIONS, *RIG_OPTIONS, *CONTROLLER_OPTIONS]
 
 
 def add_command(commands: Any) -> None:
@@ -28,14 +30,17 @@ def add_command(commands: Any) -> None:
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
-    plant = build_plant(sections["plant"])
+    rig = build_rig(sections["plant"])
+    plant = plant_of(rig)
     controller = build_hybrid(sections["controller"], plant)
     notes = notes_on(sections["plant"], plant, {"the controller": controller})
+    if parts_of(rig):
+        notes.append(f"these checks are of the plant alone: of the rig's {', '.join(parts_of(rig))} they know nothing")
     announce("design", notes)
     regulator: Any = controller.regulator
     check = check_design(plant, regulator, controller.gate)
     path = given.out / "design.json"
-    setting = {"seed": given.seed, "plant": io.encode(plant), "controller": io.encode(controller), "notes": notes}
+    setting = {"seed": given.seed, **io.encode_bench(rig), "controller": io.encode(controller), "notes": notes}
     files.write_json(path, document(check, **setting))
 
     from cpjax.show.design import instability, picture, rows

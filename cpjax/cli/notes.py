@@ -10,13 +10,13 @@ import numpy as np
 from cpjax import files, paper
 from cpjax.cli.output import complain
 from cpjax.controllers import StateFeedback
-from cpjax.plant import CartPole, Motor
+from cpjax.plant import CartPole
 from cpjax.presets import differences, model_differences
-from cpjax.pytree import Number, rules
+from cpjax.pytree import numbers
+from cpjax.rig import PRESETS as RIGS
 
-_MOTOR = {key: rule for key, rule in rules(Motor).items() if isinstance(rule, Number)}
 _SUPPLY = "voltage_limit"
-"""The field of `Motor` that is no property of the motor itself; linear models do not depend on it."""
+"""The number of a drive that is no property of the motor itself; linear models do not depend on it."""
 
 
 def announce(command: str, notes: Sequence[str]) -> None:
@@ -35,21 +35,24 @@ def notes_on(given: Mapping[str, Any], plant: CartPole, controllers: Mapping[str
 
 def plant_notes(given: Mapping[str, Any], plant: CartPole) -> list[str]:
     """Returns a note with the fields that were left at their defaults, if a motor was given in part."""
-    base = given.get("base", "appendix")
-    stated = {key for key in _MOTOR if key in given}
+    declared = numbers(type(plant.motor))
+    stated = {key for key in declared if key in given}
+    base = given.get("rig", given.get("base", "appendix"))
     whose = f"the {base} plant's"
-    if base not in paper.PLANTS:
+    if base not in paper.PLANTS and base not in RIGS:
         table = files.read_table(Path(base))
-        table = table.get("plant", table) if "type" not in table else table
-        motor = table.get("motor", {})
-        stated |= set(motor) & set(_MOTOR)
+        for part in ("rig", "plant") if "type" not in table else ():
+            table = table.get(part, table) if "type" not in table else table
+        motor = table.get("plant", table).get("motor", {})
+        stated |= set(motor) & set(declared)
         whose = "the paper's"
         if not stated:
             stated = {""}  # a plant without a motor: the note lists all of its fields
-    left = [key for key in _MOTOR if key not in stated]
-    if not stated - {_SUPPLY} or not set(left) - {_SUPPLY}:
+    left = [key for key in declared if key not in stated]
+    of_the_motor = {key for key in left if declared[key].linear}
+    if not {key for key in stated if key not in declared or declared[key].linear} or not of_the_motor:
         return []
-    values = ", ".join(f"{key} = {float(getattr(plant.motor, key)):g} {_MOTOR[key].unit}" for key in left)
+    values = ", ".join(f"{key} = {float(getattr(plant.motor, key)):g} {declared[key].unit}" for key in left)
     mass, damping = float(plant.motor.reflected_mass), float(plant.motor.damping)
     return [
         f"the motor was given in part; left at {whose} values: {values}. Behind its gear and wheel the rotor weighs "

@@ -9,16 +9,18 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from cpjax import files, io, paper
-from cpjax.cli.builders import PLANT_OPTIONS, build_plant
+from cpjax.cli.builders import PLANT_OPTIONS
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, options_of, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import compiling, progress
+from cpjax.cli.rigs import RIG_OPTIONS, build_rig, refuse_parts
 from cpjax.cli.tables import print_table
 from cpjax.errors import InputError
 from cpjax.paper.comparison import Compared, compare, entries
 from cpjax.paper.reproduction import DESIGNS, EvaluationConfig
 from cpjax.plant import CartPole
+from cpjax.rig import Rig, plant_of
 from cpjax.study.fronts.config import COSTS, FrontConfig
 from cpjax.workspace import Workspace
 
@@ -43,6 +45,7 @@ OPTIONS = [
         count="+",
     ),
     *PLANT_OPTIONS,
+    *RIG_OPTIONS,
 ]
 
 
@@ -62,7 +65,9 @@ def add_command(commands: Any) -> None:
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
-    plant = build_plant(sections["plant"])
+    rig = build_rig(sections["plant"])
+    refuse_parts(rig, "pareto", honoured=("track",))
+    plant = plant_of(rig)
     chosen = dict(sections["front"])
     supplies = tuple(chosen.pop("supplies", SUPPLIES))
     for supply in supplies:
@@ -71,7 +76,7 @@ def run(given: argparse.Namespace) -> int:
     plan = FrontConfig(seed=given.seed, **chosen)
     notes = notes_on(sections["plant"], plant)
     announce("pareto", notes)
-    found, _ = run_pareto(given.out, given.out / "pareto.parts", plant, plan, supplies, notes)
+    found, _ = run_pareto(given.out, given.out / "pareto.parts", rig, plan, supplies, notes)
     print_table(*table(found), text_columns=2)
     from cpjax.show.front import findings
 
@@ -81,12 +86,18 @@ def run(given: argparse.Namespace) -> int:
 
 
 def run_pareto(
-    out: Path, parts: Path, plant: CartPole, plan: FrontConfig, supplies: tuple[float, ...], notes: Sequence[str] = ()
+    out: Path,
+    parts: Path,
+    rig: Rig | CartPole,
+    plan: FrontConfig,
+    supplies: tuple[float, ...],
+    notes: Sequence[str] = (),
 ) -> tuple[Found, dict[str, bytes]]:
     """Traces the fronts of both designs and writes pareto.json, pareto.png and supplies.png.
 
     Args:
       parts: folder of finished searches, from which an interrupted run goes on; removed at the end.
+      rig: the plant, or a rig, of which plant and track count.
       supplies: further voltage limits for settling time against effort [V].
       notes: for the JSON.
 
@@ -95,16 +106,17 @@ def run_pareto(
     """
     from cpjax.study.fronts.reference_point import reference_points
 
-    request = {"plan": dataclasses.asdict(plan), "plant": io.encode(plant), "supplies": supplies}
+    plant = plant_of(rig)
+    request = {"plan": dataclasses.asdict(plan), **io.encode_bench(rig), "supplies": supplies}
     with Workspace(parts, {**request, "versions": files.versions()}) as memory:
-        measure = reference_points(plant, plan, supplies)
-        found = {design: trace_design(memory, plant, design, plan, supplies, measure) for design in DESIGNS}
-        known = known_controllers(plant, plan)
+        measure = reference_points(rig, plan, supplies)
+        found = {design: trace_design(memory, rig, design, plan, supplies, measure) for design in DESIGNS}
+        known = known_controllers(rig, plan)
         document = {
             "what": "mean settling time against mean cost, of controllers that no other found beats",
             "versions": files.versions(),
             "plan": dataclasses.asdict(plan),
-            "plant": io.encode(plant),
+            **io.encode_bench(rig),
             "fronts": found,
             "notes": notes,
             "known": [{"name": name, "design": one.entry.design, **one.summary} for name, one in known],
@@ -116,7 +128,7 @@ def run_pareto(
     return found, pictures
 
 
-def known_controllers(plant: CartPole, plan: FrontConfig) -> list[tuple[str, Compared]]:
+def known_controllers(rig: Rig | CartPole, plan: FrontConfig) -> list[tuple[str, Compared]]:
     """Evaluates the paper's printed gains and cpjax's presets from the initial states that measure the points."""
     from cpjax.study.fronts.evaluator import FINAL
     from cpjax.tune.descent import derive_seed
@@ -124,16 +136,17 @@ def known_controllers(plant: CartPole, plan: FrontConfig) -> list[tuple[str, Com
     setting = EvaluationConfig(
         count=plan.final, seed=derive_seed(plan.seed, FINAL, 0), duration=plan.horizon, dt=plan.final_dt
     )
+    plant = plant_of(rig)
     chosen = [one for one in entries(plant) if one.gains != "computed"]
     own = io.encode(plant) == io.encode(paper.appendix_plant())
     preset = "tuned, as shipped" if own else "as shipped for the appendix's plant"
-    compared = compare(plant, chosen, setting)[1]
+    compared = compare(rig, chosen, setting)[1]
     return [(preset if one.entry.gains == "tuned" else one.entry.name, one) for one in compared]
 
 
 def trace_design(
     memory: Workspace,
-    plant: CartPole,
+    rig: Rig | CartPole,
     design: paper.Design,
     plan: FrontConfig,
     supplies: tuple[float, ...],
@@ -149,7 +162,7 @@ def trace_design(
 
     with progress(f"pareto, {design}") as report:
         fronts = trace_fronts(
-            plant,
+            rig,
             design,
             plan,
             measure.reference,

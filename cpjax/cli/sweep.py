@@ -1,20 +1,23 @@
 """`cpjax sweep`: runs from many initial states, as a table, a picture and a file of all results."""
 
 import argparse
+import dataclasses
 import time
 from typing import Any
 
 import numpy as np
 
 from cpjax import files, io
-from cpjax.cli.builders import CONTROLLER_OPTIONS, EVALUATION_OPTIONS, PLANT_OPTIONS, build_controller, build_plant
+from cpjax.cli.builders import CONTROLLER_OPTIONS, EVALUATION_OPTIONS, PLANT_OPTIONS, build_controller
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
+from cpjax.cli.rigs import FIRMWARE_OPTIONS, RIG_OPTIONS, build_firmware, build_rig, split_period, with_usual_period
 from cpjax.cli.tables import print_table
 from cpjax.plant.initial_states import sample_starts
-from cpjax.sim.metrics import ProtocolMetrics
+from cpjax.rig import plant_of
+from cpjax.sim.rollout import default_metrics
 from cpjax.study.recording import SUFFIXES, record_sweep
 from cpjax.study.summary import COSTS, summarise
 
@@ -26,7 +29,9 @@ OPTIONS = [
     Option("sweep", "format", "of the results (default npz; parquet needs pyarrow)", choices=_FORMATS),
     Option("sweep", "save_every", "keep every so many steps of the trajectories, instead of metrics", int),
     *PLANT_OPTIONS,
+    *RIG_OPTIONS,
     *CONTROLLER_OPTIONS,
+    *FIRMWARE_OPTIONS,
 ]
 
 
@@ -45,17 +50,22 @@ def add_command(commands: Any) -> None:
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
-    plant = build_plant(sections["plant"])
+    rig = build_rig(sections["plant"])
+    plant = plant_of(rig)
     controller = build_controller(sections["controller"], plant)
-    notes = notes_on(sections["plant"], plant, {"the controller": controller})
+    stated, estimation = split_period(sections["evaluation"], sections["firmware"])
+    setting = {"starts": "hanging", "count": 4096, "duration": 20.0, "dt": 0.002, **stated}
+    setting = with_usual_period(setting, stated, sections["plant"])
+    firmware = build_firmware(estimation, rig, setting, given.seed, controller)
+    notes = [*notes_on(sections["plant"], plant, {"the controller": controller}), *firmware.notes]
     announce("sweep", notes)
-    setting = {"starts": "hanging", "count": 4096, "duration": 20.0, "dt": 0.002, **sections["evaluation"]}
     chosen = {"precision": "float64", "format": "npz", **sections["sweep"]}
     name, count = setting.pop("starts"), setting.pop("count")
     starts = sample_starts(name, count, seed=given.seed, dtype=np.dtype(chosen["precision"]))
     save_every = chosen.get("save_every")
     path = given.out / ("trajectories" if save_every is not None else f"metrics.{chosen['format']}")
-    metric = ProtocolMetrics(reference_x=sections["controller"].get("reference_x", 0.0))
+    usual: Any = default_metrics(rig)
+    metric = dataclasses.replace(usual, reference_x=sections["controller"].get("reference_x", 0.0))
     begin = time.perf_counter()
     with progress("sweep") as report:
 
@@ -65,10 +75,10 @@ def run(given: argparse.Namespace) -> int:
 
         metrics = record_sweep(
             path,
-            plant,
-            controller,
+            rig,
+            firmware(controller),
             starts,
-            **setting,
+            **{**setting, **firmware.simulation},
             clock="sampled",
             metrics=metric,
             save_every=save_every,
@@ -93,8 +103,9 @@ def run(given: argparse.Namespace) -> int:
         "starts": name,
         "run": setting,
         "precision": chosen["precision"],
-        "plant": io.encode(plant),
+        **io.encode_bench(rig),
         "controller": io.encode(controller),
+        **firmware.entries(),
         "notes": notes,
         "file": path.name,
         "seconds": seconds,

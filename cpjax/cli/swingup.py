@@ -1,6 +1,7 @@
 """`cpjax swingup`: one rollout, as a table, a picture and JSON."""
 
 import argparse
+import dataclasses
 import math
 from typing import Any
 
@@ -15,19 +16,20 @@ from cpjax.cli.builders import (
     RUN_OPTIONS,
     START_OPTIONS,
     build_controller,
-    build_plant,
     build_start,
 )
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import add_options, resolve
 from cpjax.cli.output import say
+from cpjax.cli.rigs import ESTIMATOR_OPTIONS, RIG_OPTIONS, build_firmware, build_rig, with_usual_period
 from cpjax.controllers import REGULATE, Hybrid
 from cpjax.errors import InputError
+from cpjax.rig import plant_of
 from cpjax.sim.flags import STOPPED, Flag, describe
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
-from cpjax.sim.rollout import Trajectory, rollout
+from cpjax.sim.rollout import Trajectory, default_metrics, rollout
 
-OPTIONS = [*START_OPTIONS, *RUN_OPTIONS, *PLANT_OPTIONS, *CONTROLLER_OPTIONS]
+OPTIONS = [*START_OPTIONS, *RUN_OPTIONS, *PLANT_OPTIONS, *RIG_OPTIONS, *CONTROLLER_OPTIONS, *ESTIMATOR_OPTIONS]
 
 _ROWS = (
     ("settling time", "settling_time", "s"),
@@ -51,15 +53,19 @@ def add_command(commands: Any) -> None:
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
-    plant = build_plant(sections["plant"])
+    rig = build_rig(sections["plant"])
+    plant = plant_of(rig)
     controller = build_controller(sections["controller"], plant)
-    notes = notes_on(sections["plant"], plant, {"the controller": controller})
+    settings: dict[str, Any] = {"duration": 20.0, "dt": 0.002, "clock": "sampled", **sections["run"]}
+    settings = with_usual_period(settings, sections["run"], sections["plant"])
+    firmware = build_firmware(sections["firmware"], rig, settings, given.seed, controller)
+    notes = [*notes_on(sections["plant"], plant, {"the controller": controller}), *firmware.notes]
     announce("swingup", notes)
     start = build_start(sections["start"], given.seed)
-    settings = {"duration": 20.0, "dt": 0.002, "clock": "sampled", **sections["run"]}
     try:
-        metric = ProtocolMetrics(reference_x=sections["controller"].get("reference_x", 0.0))
-        trajectory = rollout(plant, controller, start, metrics=metric, **settings)
+        metric: Any = default_metrics(rig)
+        metric = dataclasses.replace(metric, reference_x=sections["controller"].get("reference_x", 0.0))
+        trajectory = rollout(rig, firmware(controller), start, metrics=metric, **{**settings, **firmware.simulation})
     except InputError as problem:
         raise InputError(problem.field.replace("start.", "start "), problem.value, problem.allowed) from problem
     metrics = trajectory.metrics
@@ -70,8 +76,9 @@ def run(given: argparse.Namespace) -> int:
         "seed": given.seed,
         "run": settings,
         "start": io.encode(start),
-        "plant": io.encode(plant),
+        **io.encode_bench(rig),
         "controller": io.encode(controller),
+        **firmware.entries(),
         "notes": notes,
         "flag": describe(metrics.flag),
         "metrics": {name: getattr(metrics, name) for name in metrics.__dataclass_fields__},
@@ -132,6 +139,9 @@ def reason(run: Trajectory, metric: ProtocolMetrics, *, hybrid: bool) -> str:
         held = np.all(states == states[-1], axis=1)
         since = float(run.time[_first_of_the_last(held)])
         what = "left all bounds" if flag & int(Flag.RUNAWAY) else "could not be computed any further"
+        step, track = float(run.time[-1] - run.time[-2]), float(metric.track_limit)
+        if flag & int(Flag.RUNAWAY) and abs(x) + 2.0 * step * abs(states[-1, 1]) >= track:
+            return f"the cart left the track, {track:g} m each way, at {since:.3g} s"
         more = "; an integrator that is unstable for too long a step looks the same: try a smaller dt"
         return f"the state {what} at {since:.3g} s" + ("" if flag & int(Flag.OVERFLOW) else more)
     acting = np.asarray(run.mode) == REGULATE

@@ -8,16 +8,18 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from cpjax import files, io
-from cpjax.cli.builders import PLANT_OPTIONS, build_plant, saved
+from cpjax.cli.builders import PLANT_OPTIONS, saved
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, options_of, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import compiling, progress
+from cpjax.cli.rigs import RIG_OPTIONS, build_rig, refuse_parts
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
 from cpjax.paper.initial import initial_controller
 from cpjax.plant import CartPole
+from cpjax.rig import Rig, plant_of
 from cpjax.tune.baseline import GateKind
 from cpjax.tune.config import TuningConfig
 from cpjax.tune.objective import Goal
@@ -28,6 +30,7 @@ if TYPE_CHECKING:  # imports optax, which is slow
 
 OPTIONS = [
     *PLANT_OPTIONS,
+    *RIG_OPTIONS,
     Option("tune", "design", "of the regulator (default lqr)", choices=("lqr", "placement")),
     Option("tune", "start_from", "baseline, paper, or a file with a controller that has a design (default baseline)"),
     Option("tune", "gate", "of baseline and paper (default angle-rate)", choices=get_args(GateKind)),
@@ -54,16 +57,25 @@ def add_command(commands: Any) -> None:
 def run(given: argparse.Namespace) -> int:
     """Runs the command."""
     sections = resolve(given, OPTIONS)
-    plant = build_plant(sections["plant"])
+    rig = build_rig(sections["plant"])
+    refuse_parts(rig, "tune", honoured=("track",))
+    plant = plant_of(rig)
     setting = dict(sections["tune"])
     chosen: dict[str, Any] = {key: setting.pop(key) for key in ("design", "gate") if key in setting}
     controller = _begin(setting.pop("start_from", "baseline"), plant, chosen)
     notes = notes_on(sections["plant"], plant, {"the controller to start from": controller})
+    goal = dict(sections["goal"])
+    if isinstance(rig, Rig) and rig.track is not None:
+        goal = _within(float(rig.track.half_length), goal)
+        notes.append(
+            f"the rig's track counts as the goal's: track_limit {goal['track_limit']:g} m, weight track "
+            f"{goal['track']:g}"
+        )
     announce("tune", notes)
     names = {key: _names(setting.pop(key)) for key in ("free", "frozen") if key in setting}
     free = free_parameters(controller, **names, full_q=setting.pop("full_q", "diagonal") == "full")
-    plan = TuningConfig(seed=given.seed, goal=Goal(**sections["goal"]), **setting)
-    tuning, _ = run_tuning(given.out, plant, free, plan, given.out / "checkpoint.npz", notes)
+    plan = TuningConfig(seed=given.seed, goal=Goal(**goal), **setting)
+    tuning, _ = run_tuning(given.out, rig, free, plan, given.out / "checkpoint.npz", notes)
     before = np.asarray(free.physical(free.start()))
     rows = [(label, f"{a:.4g}", f"{b:.4g}") for label, a, b in zip(tuning.labels, before, tuning.physical, strict=True)]
     print_table("Parameters, SI units", ("parameter", "start", "tuned"), rows, text_columns=1)
@@ -78,21 +90,28 @@ def run(given: argparse.Namespace) -> int:
 
 
 def run_tuning(
-    out: Path, plant: CartPole, free: FreeParameters, plan: TuningConfig, checkpoint: Path, notes: Sequence[str] = ()
+    out: Path,
+    rig: Rig | CartPole,
+    free: FreeParameters,
+    plan: TuningConfig,
+    checkpoint: Path,
+    notes: Sequence[str] = (),
 ) -> "tuple[Tuning, bytes]":
     """Runs the tuning, writes tuned.json, tune.json and tune.png, and returns the tuning and the picture.
 
     Args:
+      rig: the plant, or a rig whose track, if any, is the goal's.
       checkpoint: NPZ file from which an interrupted run goes on; removed at the end.
       notes: for the JSON.
     """
     from cpjax.tune.outcome import document
     from cpjax.tune.tuner import tune  # imports optax, which is slow; other commands need none
 
+    plant = plant_of(rig)
     with progress("tune") as report:
         tuning = tune(plant, free, plan, progress=compiling(report, "loss"), checkpoint=checkpoint)
     io.save(out / "tuned.json", tuning.controller)
-    files.write_json(out / "tune.json", {**document(tuning, plant, free, plan), "notes": notes})
+    files.write_json(out / "tune.json", {**document(tuning, plant, free, plan), **io.encode_bench(rig), "notes": notes})
 
     from cpjax.show.figures import save_figure
     from cpjax.show.tuning import picture
@@ -111,6 +130,14 @@ def _begin(name: str, plant: Any, chosen: dict[str, Any]) -> Hybrid:
     if not isinstance(loaded, Hybrid):
         raise InputError("start_from", name, "a file that holds a Hybrid")
     return loaded
+
+
+def _within(half_length: float, goal: dict[str, Any]) -> dict[str, Any]:
+    """Returns the goal with a track's limit [m] and a weight of the time beyond it, unless they are given."""
+    limit = goal.get("track_limit", half_length)
+    if limit > half_length:
+        raise InputError("track_limit", limit, f"at most that of the rig's track, {half_length:g} m")
+    return {"track": 1.0, **goal, "track_limit": limit}
 
 
 def _names(text: str) -> list[str]:

@@ -13,7 +13,9 @@ from cpjax.plant import CartPole
 from cpjax.plant.initial_states import sample_starts
 from cpjax.plant.state import State
 from cpjax.presets import preset
-from cpjax.sim.metrics import Metrics, ProtocolMetrics
+from cpjax.rig import Rig
+from cpjax.sim.metrics import Metrics
+from cpjax.sim.rollout import default_metrics
 from cpjax.sim.sweep import sweep
 from cpjax.study.summary import summarise
 
@@ -63,38 +65,45 @@ def entries(plant: CartPole, tuned: Mapping[paper.Design, Hybrid] | None = None)
 
 
 def compare(
-    plant: CartPole,
+    plant: CartPole | Rig,
     chosen: Sequence[Entry],
     setting: EvaluationConfig,
     *,
     track_limit: float = float("inf"),
     progress: Report | None = None,
+    firmware: Callable[[Any], Any] | None = None,
+    **simulation: Any,
 ) -> tuple[State, list[Compared]]:
     """Runs every entry from the same initial states, as the protocol's evaluation prescribes.
 
     Args:
-      plant: the plant.
+      plant: the plant, or a rig with it.
       chosen: the entries.
       setting: initial states, duration and step of the evaluation.
-      track_limit: largest |x| of a successful run [m].
+      track_limit: largest |x| of a successful run [m]; a shorter track of the rig stays as it is.
       progress: called with the entries done, their number, and the next one in words.
+      firmware: returns what runs around an entry's controller, such as a `cpjax.Digital`; by default itself.
+      simulation: further arguments of `cpjax.sweep`, such as the control period.
 
     Returns:
       The initial states, arrays (count,), and the results in the order of the entries.
     """
     starts = sample_starts(setting.starts, setting.count, seed=setting.seed)
+    usual: Any = default_metrics(plant)
+    metric = dataclasses.replace(usual, track_limit=min(track_limit, float(usual.track_limit)))
     results = []
     for i, entry in enumerate(chosen):
         if progress is not None:
             progress(i, len(chosen), f"{entry.name}, {entry.design}, {entry.gains}")
         metrics: Metrics = sweep(
             plant,
-            entry.controller,
+            entry.controller if firmware is None else firmware(entry.controller),
             starts,
             duration=setting.duration,
             dt=setting.dt,
             clock="sampled",
-            metrics=ProtocolMetrics(track_limit=track_limit),
+            metrics=metric,
+            **simulation,
         )
         results.append(Compared(entry, metrics, summarise(metrics)))
     if progress is not None:
@@ -102,7 +111,9 @@ def compare(
     return starts, results
 
 
-def document(plant: CartPole, results: Sequence[Compared], setting: EvaluationConfig, **others: Any) -> dict[str, Any]:
+def document(
+    plant: CartPole | Rig, results: Sequence[Compared], setting: EvaluationConfig, **others: Any
+) -> dict[str, Any]:
     """Returns the comparison as plain values, for JSON, beside the entries of `others`."""
     rows = [
         {
@@ -117,7 +128,7 @@ def document(plant: CartPole, results: Sequence[Compared], setting: EvaluationCo
     return {
         "versions": files.versions(),
         "setting": dataclasses.asdict(setting),
-        "plant": io.encode(plant),
+        **io.encode_bench(plant),
         "rows": rows,
         **others,
     }

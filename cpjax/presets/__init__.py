@@ -10,8 +10,8 @@ import numpy as np
 from cpjax import io
 from cpjax.controllers import DesignName, Hybrid
 from cpjax.errors import InputError
-from cpjax.plant import CartPole, Motor
-from cpjax.pytree import Number, rules
+from cpjax.plant import CartPole
+from cpjax.pytree import numbers
 
 PRESETS: Mapping[DesignName, str] = {"lqr": "tuned_lqr", "placement": "tuned_place"}
 """File name, without extension, of each design's preset in this folder; written by `cpjax.save`."""
@@ -55,19 +55,25 @@ def model_differences(controller: Any, plant: CartPole) -> list[str]:
 
 
 def differences(one: CartPole, other: CartPole) -> dict[str, tuple[Any, Any]]:
-    """Returns both values of each number of CartPole and Motor that differs by more than a rounding to float32."""
-    pairs = [(cls, a, b) for cls, a, b in ((CartPole, one, other), (Motor, one.motor, other.motor))]
-    values = {
-        name: (_known(getattr(a, name), rule), _known(getattr(b, name), rule))
-        for cls, a, b in pairs
-        for name, rule in rules(cls).items()
-        if isinstance(rule, Number)
-    }
+    """Returns both values of each number of plant and drive that differs by more than a rounding to float32.
+
+    Drives of different kinds are compared by what they do to the cart.
+    """
+    pairs = [(a, b, name) for a, b in ((one, other), (one.motor, other.motor)) for name in _comparable(a, b)]
+    values = {name: (_known(a, name), _known(b, name)) for a, b, name in pairs}
     return {name: two for name, two in values.items() if not np.allclose(*two, rtol=1e-6, atol=0.0)}
 
 
-def _known(value: Any, rule: Number) -> Any:
-    return rule.neutral if value is None else value
+def _comparable(one: Any, other: Any) -> tuple[str, ...]:
+    """Returns the names of the numbers that two plants or two drives are compared by."""
+    if isinstance(one, type(other)) or isinstance(other, type(one)):
+        return tuple(name for name in numbers(type(one)) if name in numbers(type(other)))
+    return ("force_per_voltage", "damping", "reflected_mass", "voltage_limit")
+
+
+def _known(part: Any, name: str) -> Any:
+    value, rule = getattr(part, name), numbers(type(part)).get(name)
+    return rule.neutral if value is None and rule is not None else value
 
 
 def _text(value: Any) -> str:

@@ -1,6 +1,6 @@
 """Parts of a rig beside its plant: sensors, drive, track and disturbance."""
 
-from cpjax.rig.bench import Rig
+from cpjax.rig.bench import Rig, plant_of
 from cpjax.rig.disturbance import Disturbance, Pushes, RandomPushes, Wind
 from cpjax.rig.drive import Drive
 from cpjax.rig.presets import PRESETS, rig
@@ -19,5 +19,6 @@ __all__ = [
     "StateSensors",
     "Track",
     "Wind",
+    "plant_of",
     "rig",
 ]

@@ -76,3 +76,8 @@ class Rig:
         if track is not None and stops:
             return in_contact(plant, track.half_length, track.restitution)
         return in_contact(plant)
+
+
+def plant_of(rig: Rig | CartPole) -> CartPole:
+    """Returns the plant of a rig; a plant alone is its own."""
+    return rig.plant if isinstance(rig, Rig) else rig

@@ -139,6 +139,14 @@ def on_bench(rig: Rig, controller: Any, settings: Settings, dt: float, seed: int
         if rig.sensors is not None or steps or noise is not None:
             name = "sensors" if rig.sensors is not None else "drive.delay" if steps else "drive.noise"
             raise InputError("clock", settings.clock, f"sampled: the rig's {name} act at control instants")
+        shaped = rig.drive is not None and (
+            rig.drive.voltage_step is not None
+            or is_traced(rig.drive.dead_band)
+            or np.any(np.asarray(rig.drive.dead_band))
+        )
+        if shaped and settings.switching == "located":
+            allowed = "per_step, or the sampled clock: a dead band and steps of the voltage are not located"
+            raise InputError("switching", settings.switching, allowed)
         return controller, settings
     if rig.sensors is None and not steps and noise is None:
         return controller, settings

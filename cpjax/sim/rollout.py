@@ -69,7 +69,7 @@ class Trajectory:
 
 
 def rollout(
-    plant: Plant,
+    plant: Plant | Rig,
     controller: Controller | ModalController | Law,
     start: PlantState,
     *,
@@ -82,7 +82,7 @@ def rollout(
     numbers (initial state, gains, parameters, dt at an equal count of steps) share one compilation.
 
     Args:
-      plant: a `CartPole`, or a plant of your own (see `cpjax.sim.plants.Plant`).
+      plant: a `CartPole`, a `cpjax.Rig`, or a plant of your own (see `cpjax.sim.plants.Plant`).
       controller: a `Hybrid`, a law, or a controller with memory (see `cpjax.controllers.protocol`).
       start: the initial state, of scalars. For many, use `cpjax.sweep` or `jax.vmap`.
       metrics: a metric, updated at every step; by default `ProtocolMetrics()` for a `CartPole`, none for other plants.
@@ -106,7 +106,7 @@ def rollout(
 
 
 def measure(
-    plant: Plant,
+    plant: Plant | Rig,
     controller: Controller | ModalController | Law,
     start: PlantState,
     *,

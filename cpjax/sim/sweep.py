@@ -22,6 +22,7 @@ from cpjax.backend import runtime
 from cpjax.controllers.protocol import Controller, Law, ModalController
 from cpjax.errors import InputError
 from cpjax.pytree import is_traced
+from cpjax.rig import Rig
 from cpjax.sim.flags import NEEDS_RECOMPUTE
 from cpjax.sim.initial import component_names
 from cpjax.sim.metrics import Metric, Sample
@@ -55,7 +56,7 @@ _EVERYWHERE: Any = PartitionSpec()  # type: ignore[no-untyped-call]
 
 
 def sweep(
-    plant: Plant,
+    plant: Plant | Rig,
     controller: Controller | ModalController | Law,
     starts: PlantState,
     *,
@@ -193,7 +194,7 @@ class SweepPlan(NamedTuple):
 
 
 def prepare(
-    plant: Plant,
+    plant: Plant | Rig,
     controller: Controller | ModalController | Law,
     starts: PlantState,
     *,

@@ -15,6 +15,7 @@ from jaxtyping import Shaped
 from cpjax import archive, files, io
 from cpjax.controllers.protocol import Controller, Law, ModalController, as_controller
 from cpjax.errors import InputError
+from cpjax.rig import Rig
 from cpjax.sim.metrics import Metric
 from cpjax.sim.plants import Plant, PlantState
 from cpjax.sim.rollout import default_metrics
@@ -31,7 +32,7 @@ _DIGEST, _LAYOUT = "digest", "layout"  # keys of the checksum, and of the layout
 
 def record_sweep(
     path: str | Path,
-    plant: Plant,
+    plant: Plant | Rig,
     controller: Controller | ModalController | Law,
     starts: PlantState,
     *,
@@ -76,7 +77,7 @@ def record_sweep(
         "run": {key: value for key, value in run.items() if value is not None},
         "count": work.total,
         "dtype": str(work.leaves[0].dtype),
-        "plant": _described(plant),
+        **{key: _described(part) for key, part in _parts(plant).items()},
         "controller": _described(as_controller(controller)),
         "metrics": _described(default_metrics(plant) if metrics is None else metrics),
     }
@@ -196,6 +197,11 @@ def _pyarrow() -> Any:
     except ImportError as problem:
         raise InputError("path", ".parquet", "another suffix, or pyarrow installed: pip install pyarrow") from problem
     return pyarrow
+
+
+def _parts(plant: Any) -> dict[str, Any]:
+    """Returns the plant by the name `plant` and, if it stands on a rig, the rig by the name `rig`."""
+    return {"plant": plant.plant, "rig": plant} if isinstance(plant, Rig) else {"plant": plant}
 
 
 def _described(component: Any) -> Any:

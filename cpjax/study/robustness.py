@@ -138,8 +138,8 @@ def robustness_card(
     """Computes the robustness card of a controller on a rig.
 
     Runs follow the evaluation protocol for rigs: from `hanging` (the cart within a quarter of the half track, where
-    that is less than 0.1 m), 20 s or 12 natural periods of the pendulum if that is longer, settled within `target_bands`;
-    leaving the track is failure unless it has stops.
+    that is less than 0.1 m), 20 s or 12 natural periods of the pendulum if that is longer, settled within
+    `target_bands`; leaving the track is failure unless it has stops.
 
     Args:
       rig: the rig, with sensors, drive and track of its own; a bare plant is an ideal rig.

@@ -22,8 +22,10 @@ from cpjax import (
     AngleGate,
     CartPole,
     EnergySwingUp,
+    ForceActuator,
     Hybrid,
     InputError,
+    LumpedMotor,
     LyapunovGate,
     Metrics,
     Motor,
@@ -42,6 +44,7 @@ from cpjax.cli.reproduce import print_rows
 from cpjax.cli.swingup import OPTIONS
 from cpjax.paper import reproduction
 from cpjax.paper.reproduction import EvaluationConfig, evaluate, reproduce, trajectory, variants
+from cpjax.pytree import numbers
 from cpjax.study.summary import summarise
 
 SETTING = EvaluationConfig(count=8, duration=12.0, dt=0.01)
@@ -239,8 +242,15 @@ def toml_of(case):
     return "".join(f"[{section}]\n" + "\n".join(lines) + "\n" for section, lines in sections.items())
 
 
-def test_the_cases_cover_every_option_that_is_no_file():
-    assert {path for case in CASES for path in case} == {f"{o.section}.{o.key}" for o in OPTIONS} - {"controller.file"}
+OF_OTHER_DRIVES = {f"plant.{name}" for cls in (LumpedMotor, ForceActuator) for name in numbers(cls)}
+OF_RIGS = {"plant.rig", "plant.without", "firmware.estimator", "firmware.cutoff"}
+"""Tested in test_rig_command.py."""
+
+
+def test_the_cases_cover_every_option_that_is_no_file_and_of_no_rig():
+    options = {f"{o.section}.{o.key}" for o in OPTIONS}
+    cases = {path for case in CASES for path in case}
+    assert cases == options - {"controller.file"} - OF_RIGS - (OF_OTHER_DRIVES - cases)
 
 
 @pytest.fixture(scope="module")

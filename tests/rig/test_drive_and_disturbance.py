@@ -179,6 +179,12 @@ def test_derivatives_through_drive_and_disturbance_are_those_of_differences():
     ("call", "field"),
     [
         (lambda: Drive(lag=0.0), "lag"),
+        (
+            lambda: cpjax.measure(
+                Rig(PLANT, drive=Drive(dead_band=1.0)), LAW, START, duration=0.1, dt=0.01, switching="located"
+            ),
+            "switching",
+        ),
         (lambda: Drive(noise=-1.0), "noise"),
         (lambda: Pushes(times=[0.1], cart=[1.0, 2.0], pole=[0.0]), "Pushes.cart"),
         (lambda: RandomPushes(every=0.1, duration=0.2), "duration"),

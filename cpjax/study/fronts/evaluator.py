@@ -18,6 +18,7 @@ from cpjax.plant import CartPole, with_parameters
 from cpjax.plant.initial_states import sample_starts
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar
+from cpjax.rig import Rig, plant_of
 from cpjax.sim.metrics import Metrics
 from cpjax.sim.sweep import sweep
 from cpjax.study.fronts.config import COSTS, FrontConfig
@@ -90,20 +91,28 @@ class Evaluated(NamedTuple):
 class Evaluator:
     """Builds and evaluates one design's controllers at any supply, and counts the steps simulated.
 
+    Of a rig, plant and track count.
+
     Attributes:
       free: the free parameters of the baseline controller.
       steps: Runge-Kutta steps simulated so far, by supply [V].
     """
 
-    def __init__(self, plant: CartPole, design: DesignName, plan: FrontConfig) -> None:
-        self._plant, self._design, self._plan = plant, design, plan
-        self.free = free_parameters(baseline(design, plant))
+    def __init__(self, rig: Rig | CartPole, design: DesignName, plan: FrontConfig) -> None:
+        self._plant, self._design, self._plan = plant_of(rig), design, plan
+        self._track = rig.track if isinstance(rig, Rig) else None
+        self.free = free_parameters(baseline(design, self._plant))
         self.steps: Counter[float] = Counter()
         self._built = jax.jit(jax.vmap(lambda vector, supply: without_design(self.free_at(supply).build(vector))))
 
     def plant_at(self, supply: Scalar) -> CartPole:
         """Returns the plant with another voltage limit [V]."""
         return with_parameters(self._plant, {"voltage_limit": supply})
+
+    def rig_at(self, supply: Scalar) -> Rig | CartPole:
+        """Returns the plant with another voltage limit [V], on its track if there is one."""
+        plant = self.plant_at(supply)
+        return plant if self._track is None else Rig(plant, track=self._track)
 
     def free_at(self, supply: Scalar) -> FreeParameters:
         """Returns the free parameters of controllers whose law's model has this voltage limit [V]."""
@@ -129,13 +138,13 @@ class Evaluator:
           count: number of initial states.
           purpose: `REEVALUATION` and `FINAL` use `final_dt`, others `evaluation_dt`; each has its own initial states.
         """
-        plan, plant, starts = self._plan, self.plant_at(supply), self.starts(count, purpose)
+        plan, rig, starts = self._plan, self.rig_at(supply), self.starts(count, purpose)
         dt = plan.final_dt if purpose in (REEVALUATION, FINAL) else plan.evaluation_dt
         controllers = in_blocks(self._built, _CONTROLLERS, vectors, np.full(len(vectors), supply, vectors.dtype))
 
         def run(which: Int[np.ndarray, " runs"], start: Int[np.ndarray, " runs"]) -> Metrics:
             found: Metrics = sweep(
-                plant,
+                rig,
                 jax.tree.map(operator.itemgetter(which), controllers),
                 jax.tree.map(operator.itemgetter(start), starts),
                 duration=plan.horizon,

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from cpjax.controllers import DesignName
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
+from cpjax.rig import Rig, plant_of
 from cpjax.study.fronts.config import COSTS, FrontConfig, Objective
 from cpjax.study.fronts.evaluator import FINAL, Evaluator
 
@@ -45,11 +46,11 @@ def objectives(plant: CartPole, supplies: tuple[float, ...] = ()) -> list[Object
     return [*((own, cost) for cost in COSTS), *((supply, "effort") for supply in others)]
 
 
-def reference_points(plant: CartPole, plan: FrontConfig, supplies: tuple[float, ...] = ()) -> ReferencePoints:
+def reference_points(rig: CartPole | Rig, plan: FrontConfig, supplies: tuple[float, ...] = ()) -> ReferencePoints:
     """Computes the reference points from runs of the baseline controllers.
 
     Args:
-      plant: the plant.
+      rig: the plant, or a rig, of which plant and track count.
       plan: the configuration, which gives the evaluation's initial states and steps.
       supplies: further voltage limits [V].
 
@@ -57,10 +58,10 @@ def reference_points(plant: CartPole, plan: FrontConfig, supplies: tuple[float, 
       InputError: a plant without a voltage limit, or on which no design's baseline controller settles from half of the
         initial states.
     """
-    wanted = objectives(plant, supplies)
+    wanted = objectives(plant_of(rig), supplies)
     baseline: dict[DesignName, dict[Objective, Point]] = {}
     for design in get_args(DesignName):
-        evaluator = Evaluator(plant, design, plan)
+        evaluator = Evaluator(rig, design, plan)
         start = np.asarray(evaluator.free.start())[None]
         found = {
             supply: evaluator.evaluate(start, supply, plan.final, FINAL) for supply in {supply for supply, _ in wanted}

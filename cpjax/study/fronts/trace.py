@@ -31,6 +31,7 @@ from cpjax.controllers import DesignName
 from cpjax.numeric.pareto import hypervolume, nondominated
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
+from cpjax.rig import Rig, plant_of
 from cpjax.sim.metrics import TimeOutside
 from cpjax.sim.rollout import measure
 from cpjax.study.fronts.cache import Search, load_or_run
@@ -98,7 +99,7 @@ class Fronts:
 
 
 def trace_fronts(
-    plant: CartPole,
+    rig: CartPole | Rig,
     design: DesignName,
     plan: FrontConfig,
     reference: Mapping[Objective, Point],
@@ -110,7 +111,7 @@ def trace_fronts(
     """Traces the fronts of settling time against every cost at the plant's own supply, and against effort at others.
 
     Args:
-      plant: the plant.
+      rig: the plant, or a rig, of which plant and track count.
       design: "lqr" or "placement".
       plan: the configuration.
       reference: reference points of the hypervolumes by (supply, cost); see `reference_points`.
@@ -122,10 +123,10 @@ def trace_fronts(
     Raises:
       InputError: a plant without a voltage limit.
     """
-    wanted = objectives(plant, supplies)
+    wanted = objectives(plant_of(rig), supplies)
     everywhere = list(dict.fromkeys(supply for supply, _ in wanted))
     parts = plan.steps + len(everywhere) + 2 * len(wanted)
-    evaluator = Evaluator(plant, design, plan)
+    evaluator = Evaluator(rig, design, plan)
 
     def trace() -> Search:
         begin = time.perf_counter()
@@ -284,14 +285,14 @@ class Tracer:
 
     def _slope(self, vector: Vector, aim: Aim, starts: State) -> tuple[Vector, Float[Array, " costs"]]:
         """Returns the gradient, norm-clipped per initial state and then averaged; and the mean costs."""
-        plan, plant, free = self._plan, self._evaluator.plant_at(aim.supply), self._evaluator.free_at(aim.supply)
+        plan, rig, free = self._plan, self._evaluator.rig_at(aim.supply), self._evaluator.free_at(aim.supply)
         costs = (METRICS[cost] for cost in COSTS)
         terms = (TimeOutside(plan.width, plan.width), *costs, RemainingTime(plan.duration))
         metric = Lagrangian(terms, tuple(aim.multipliers), plan.stop_penalty)
 
         def objective(vector: Vector, start: State) -> tuple[Float[Array, ""], tuple[Float[Array, ""], ...]]:
             found: tuple[Float[Array, ""], tuple[Float[Array, ""], ...]] = measure(
-                plant,
+                rig,
                 free.build(vector),
                 start,
                 duration=plan.duration,
