@@ -182,7 +182,7 @@ class Count:
 
     help: str
     at_least: int = 0
-    at_most: float = 10_000_000  # beyond it what is counted would not fit in memory
+    at_most: int | float = 10_000_000  # beyond it what is counted would not fit in memory
     unit: str = ""
 
     def allowed(self) -> str:

@@ -225,6 +225,8 @@ def calls():
         "controllers.estimators.Observer.at_period": call(observer, period),
         "controllers.estimators.Observer.init": call(observer, state),
         "controllers.estimators.Observer.update": call(observer, observer.init(seen), seen, one),
+        "controllers.estimators.Observer.advance": call(observer, observer.init(seen), one),
+        "controllers.estimators.Observer.correct": call(observer, observer.init(seen), seen),
         "controllers.estimators.Observer.predict": call(observer, seen, one),
         "controllers.estimators.KalmanFilter.at_period": call(filters["time-varying"], period),
         "controllers.estimators.KalmanFilter.steady_gain": call(filters["extended"], period),
@@ -232,6 +234,8 @@ def calls():
         "controllers.estimators.KalmanFilter.update": call(
             filters["extended"], filters["extended"].init(seen), seen, one
         ),
+        "controllers.estimators.KalmanFilter.advance": call(filters["extended"], filters["extended"].init(seen), one),
+        "controllers.estimators.KalmanFilter.correct": call(filters["extended"], filters["extended"].init(seen), seen),
         "controllers.estimators.KalmanFilter.predict": call(filters["extended"], seen, one),
         "controllers.estimators.observer_gain": call(plant, pair, period),
         "controllers.digital.Digital.init": call(digital, state),

@@ -16,7 +16,7 @@ from cpjax.pytree import Scalar, count, number, part, pytree
 class Estimator(Protocol):
     """Reconstructs the state from measurements, once per control period.
 
-    For a `Digital` with a delay it also has `predict(state, command)`, the state after a control period.
+    For a `Digital` with a delay it is a `Predictor`.
     """
 
     def init(self, measurement: Any) -> Any:
@@ -34,13 +34,31 @@ class Estimator(Protocol):
         ...
 
 
+@runtime_checkable
+class Predictor(Estimator, Protocol):
+    """An estimator with a model of the plant, whose memory has a `state`; `update` is `advance`, then `correct`."""
+
+    def advance(self, memory: Any, command: Scalar) -> Any:
+        """Returns the memory a control period on, under a command [V]; before the first measurement as it is."""
+        ...
+
+    def correct(self, memory: Any, measurement: Any) -> Any:
+        """Returns the memory after a measurement."""
+        ...
+
+    def predict(self, state: State, command: Scalar) -> State:
+        """Returns the state after a control period under a command [V]."""
+        ...
+
+
 class DigitalMemory(NamedTuple):
     """Memory of a `Digital`."""
 
     estimator: Any
+    """The estimator's; with a delay that of the next control instant, before its measurement."""
     controller: Any
     commands: tuple[Float[Array, ""], ...]
-    """Last commands as they were sent, the newest first [V]: those still under way, and the one that acts."""
+    """Commands that do not act yet, and without a delay the one that acts, as they were sent; the newest first [V]."""
 
 
 @pytree
@@ -59,27 +77,33 @@ class Digital:
     delay: int = count("control periods until a command acts, as the firmware knows it", default=0, at_most=1000)
 
     def __post_init__(self) -> None:
-        if self.delay and not hasattr(self.estimator, "predict"):
-            raise InputError("Digital.estimator", self.estimator, "one with predict(state, command), for a delay")
+        if self.delay and not isinstance(self.estimator, Predictor):
+            raise InputError("Digital.estimator", self.estimator, "one with a model of the plant, for a delay")
 
     def init(self, measurement: Any) -> DigitalMemory:
         """Returns the memory before the first update."""
         first = State(measurement.x, 0.0 * measurement.x, measurement.theta, 0.0 * measurement.theta)
         inner = call("controller", as_sampled(self.controller), "init", first)
         memory = call("estimator", self.estimator, "init", measurement)
-        return DigitalMemory(memory, inner, (jnp.zeros_like(jnp.asarray(measurement.x)),) * (self.delay + 1))
+        return DigitalMemory(memory, inner, (jnp.zeros_like(jnp.asarray(measurement.x)),) * max(self.delay, 1))
 
     def update(self, memory: DigitalMemory, measurement: Any) -> tuple[DigitalMemory, Scalar]:
         """Returns the new memory and the command [V]."""
-        *under_way, acting = memory.commands
-        returned = call("estimator", self.estimator, "update", memory.estimator, measurement, acting)
-        estimator, state = pair("estimator.update", returned, "the new memory and the state")
-        for command in reversed(under_way):
-            state = call("estimator", self.estimator, "predict", state, command)
+        *later, acting = memory.commands
+        estimator: Any
+        if isinstance(self.estimator, Predictor) and self.delay:
+            # The estimate a period on is computed here and kept: the next update needs it as well.
+            estimator = self.estimator.advance(self.estimator.correct(memory.estimator, measurement), acting)
+            state = estimator.state
+            for command in reversed(later):
+                state = self.estimator.predict(state, command)
+        else:
+            returned = call("estimator", self.estimator, "update", memory.estimator, measurement, acting)
+            estimator, state = pair("estimator.update", returned, "the new memory and the state")
         returned = call("controller", as_sampled(self.controller), "update", memory.controller, state)
         inner, command = pair("controller.update", returned, "the new memory and the command")
         command = real("controller.update", command)
         least = self.dead_band * (1.0 + 1e-6)  # the band's edge itself gives 0 V
         # What the estimator is told is what the drive applies: in the band that is its edge, not the controller's wish.
         sent = jnp.where(jnp.abs(command) < least, jnp.sign(command) * least, command)
-        return DigitalMemory(estimator, inner, (sent, *under_way)), sent
+        return DigitalMemory(estimator, inner, (sent, *later)), sent

@@ -99,7 +99,7 @@ class Observer:
     period: Scalar | None = None
     """Control period of the loop [s], set by the rollout."""
     poles: PoleFactors | Sequence[complex] | None = None
-    """Of the error [1/s]; kept as `PoleFactors`."""
+    """Poles of the error [1/s]; kept as `PoleFactors`."""
     prediction: str = choice("how the plant is integrated over a period", PREDICTIONS, default="midpoint")
 
     def __post_init__(self) -> None:
@@ -121,24 +121,29 @@ class Observer:
 
     def update(self, memory: Estimate, measurement: Any, command: Scalar) -> tuple[Estimate, State]:
         """Returns the new memory and the estimate."""
-        period = _known("Observer", self.period)
-        predicted = _predicted(self.model, self.prediction, memory.state, command, memory.started * period)
-        errors = measurement.x - predicted.x, measurement.theta - predicted.theta
-        gain = jnp.asarray(self.gain)
-        state = State(
-            *(
-                getattr(predicted, name) + gain[i, 0] * errors[0] + gain[i, 1] * errors[1]
-                for i, name in enumerate(NAMES)
-            )
+        memory = self.correct(self.advance(memory, command), measurement)
+        return memory, memory.state
+
+    def advance(self, memory: Estimate, command: Scalar) -> Estimate:
+        """Returns the memory a control period on, under a command [V]; before the first measurement as it is."""
+        period = _known("Observer", self.period) * memory.started
+        return memory._replace(state=_predicted(self.model, self.prediction, memory.state, command, period))
+
+    def correct(self, memory: Estimate, measurement: Any) -> Estimate:
+        """Returns the memory after a measurement."""
+        before, gain = memory.state, jnp.asarray(self.gain)
+        errors = measurement.x - before.x, measurement.theta - before.theta
+        numbers = (
+            getattr(before, name) + gain[i, 0] * errors[0] + gain[i, 1] * errors[1] for i, name in enumerate(NAMES)
         )
-        return Estimate(state, jnp.ones_like(memory.started)), state
+        return Estimate(State(*numbers), jnp.ones_like(memory.started))
 
     def predict(self, state: State, command: Scalar) -> State:
         """Returns the state after a control period under a command [V]."""
         return _predicted(self.model, self.prediction, state, command, _known("Observer", self.period))
 
 
-Covariance: TypeAlias = tuple[Scalar, ...]
+_Covariance: TypeAlias = tuple[jax.Array, ...]
 """Upper triangle of a symmetric 4 x 4 matrix, row by row, in the order of the state."""
 
 _UPPER = [(i, j) for i in range(4) for j in range(i, 4)]
@@ -188,7 +193,7 @@ class KalmanFilter:
     period: Scalar | None = None
     """Control period of the loop [s], set by the rollout."""
     transition: Float[JaxOrNumpy, "*batch 4 4"] | None = None
-    """Of the plant linearised upright, over a control period, set by the rollout."""
+    """State matrix of the plant linearised upright, over a control period, set by the rollout."""
 
     def at_period(self, period: Scalar) -> "KalmanFilter | Observer":
         """Returns the filter for a control period [s]; a steady one as an `Observer`."""
@@ -215,13 +220,21 @@ class KalmanFilter:
         return Belief(_at_rest(measurement), tuple(numbers), jnp.zeros_like(x))
 
     def update(self, memory: Belief, measurement: Any, command: Scalar) -> tuple[Belief, State]:
-        """Returns the new memory and the estimate; the first update, whose measurement is known, changes nothing."""
-        period = _known("KalmanFilter", self.period)
-        predicted = _predicted(self.model, self.prediction, memory.state, command, period)
-        P = _propagated(self._transition(memory.state, command), memory.covariance)
+        """Returns the new memory and the estimate."""
+        memory = self.correct(self.advance(memory, command), measurement)
+        return memory, memory.state
+
+    def advance(self, memory: Belief, command: Scalar) -> Belief:
+        """Returns the memory a control period on, under a command [V]; before the first measurement as it is."""
+        T = _known("KalmanFilter", self.period) * memory.started
+        P = _propagated(self._transition(memory, command, T), memory.covariance)
         for at, deviation in ((0, self.acceleration_deviation), (2, self.angular_acceleration_deviation)):
-            P = _disturbed(P, at, deviation * deviation * period * period, period)
-        values = [getattr(predicted, name) for name in NAMES]
+            P = _disturbed(P, at, deviation * deviation * T * T, T)
+        return memory._replace(state=self._predicted(memory.state, command, T), covariance=P)
+
+    def correct(self, memory: Belief, measurement: Any) -> Belief:
+        """Returns the memory after a measurement; the first one is in the memory already."""
+        values, P = [getattr(memory.state, name) for name in NAMES], memory.covariance
         for at, measured, deviation in (
             (0, measurement.x, self.x_deviation),
             (2, measurement.theta, self.theta_deviation),
@@ -229,21 +242,26 @@ class KalmanFilter:
             values, P = _corrected(values, P, at, measured, deviation * deviation)
         found, before = (State(*values), P), (memory.state, memory.covariance)
         state, P = jax.tree.map(lambda new, old: jnp.where(memory.started > 0.0, new, old), found, before)
-        return Belief(state, P, jnp.ones_like(memory.started)), state
+        return Belief(state, P, jnp.ones_like(memory.started))
 
     def predict(self, state: State, command: Scalar) -> State:
         """Returns the state after a control period under a command [V]."""
-        return _predicted(self.model, self.prediction, state, command, _known("KalmanFilter", self.period))
+        return self._predicted(state, command, _known("KalmanFilter", self.period))
 
-    def _transition(self, state: State, command: Scalar) -> list[list[Scalar]]:
+    def _predicted(self, state: State, command: Scalar, T: Scalar) -> State:
+        return _predicted(self.model, self.prediction, state, command, T)
+
+    def _transition(self, memory: Belief, command: Scalar, T: Scalar) -> list[list[Any]]:
         """Returns the derivative of the prediction by the state: rows of four."""
         if self.kind != "extended":
-            A = jnp.asarray(self.transition)
-            return [[A[i, j] for j in range(4)] for i in range(4)]
+            A, on = jnp.asarray(self.transition), memory.started
+            return [[on * A[i, j] + (1.0 - on if i == j else 0.0) for j in range(4)] for i in range(4)]
 
         def column(name: str) -> State:
-            value = jnp.asarray(getattr(state, name))
-            along = lambda one: self.predict(dataclasses.replace(state, **{name: one}), command)  # noqa: E731
+            def along(one: Scalar) -> State:
+                return self._predicted(dataclasses.replace(memory.state, **{name: one}), command, T)
+
+            value = jnp.asarray(getattr(memory.state, name))
             return jax.jvp(along, (value,), (jnp.ones_like(value),))[1]
 
         columns = [column(name) for name in NAMES]
@@ -275,9 +293,7 @@ def kalman_observer(
       InputError: a period or deviation that is not above 0.
     """
     Number("s", "control period", above=0.0).normalise("period", period)
-    steady = KalmanFilter(
-        model, x_deviation, theta_deviation, acceleration_deviation, angular_acceleration_deviation
-    )
+    steady = KalmanFilter(model, x_deviation, theta_deviation, acceleration_deviation, angular_acceleration_deviation)
     return Observer(model, np.asarray(steady.steady_gain(period)))
 
 
@@ -353,21 +369,19 @@ def _predicted(model: CartPole, prediction: str, state: State, command: Scalar, 
     return model.state(moved(moved(q, v, 0.5 * T), after, 0.5 * T), after)
 
 
-def _propagated(A: list[list[Scalar]], P: Covariance) -> Covariance:
+def _propagated(A: list[list[Any]], P: _Covariance) -> _Covariance:
     """Returns A P A'."""
     AP = [[sum(A[i][k] * P[_PLACE[k, j]] for k in range(4)) for j in range(4)] for i in range(4)]
     return tuple(sum(AP[i][k] * A[j][k] for k in range(4)) for i, j in _UPPER)
 
 
-def _disturbed(P: Covariance, at: int, growth: Scalar, T: Scalar) -> Covariance:
+def _disturbed(P: _Covariance, at: int, growth: Any, T: Any) -> _Covariance:
     """Returns the covariance with that of an unknown acceleration added; `growth` is of the rate, at `at` + 1."""
     added = {(at, at): 0.25 * T * T * growth, (at, at + 1): 0.5 * T * growth, (at + 1, at + 1): growth}
     return tuple(p + added[place] if place in added else p for p, place in zip(P, _UPPER, strict=True))
 
 
-def _corrected(
-    values: list[Scalar], P: Covariance, at: int, measured: Scalar, noise: Scalar
-) -> tuple[list[Scalar], Covariance]:
+def _corrected(values: list[Any], P: _Covariance, at: int, measured: Any, noise: Any) -> tuple[list[Any], _Covariance]:
     """Returns estimate and covariance after a measurement of the number `at` with noise of this variance.
 
     Errors of the two positions are independent, so that they are taken one after the other, without a matrix to invert.

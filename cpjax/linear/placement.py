@@ -1,8 +1,9 @@
 """Pole placement, and a parametrisation of stable polynomials that is smooth everywhere.
 
-For several inputs see `several_inputs.py`. For one input the gain is Ackermann's (1972): K = e_n' C^-1 p(A), with C the controllability matrix and p the desired characteristic
-polynomial. The formula is known for losing digits; here it is evaluated in double-word arithmetic and loses none. It
-takes a polynomial, not poles, so that repeated poles need no special treatment.
+For several inputs see `several_inputs.py`. For one input the gain is Ackermann's (1972): K = e_n' C^-1 p(A), with C the
+controllability matrix and p the desired characteristic polynomial. The formula is known for losing digits; here it is
+evaluated in double-word arithmetic and loses none. It takes a polynomial, not poles, so that repeated poles need no
+special treatment.
 
 The derivative follows from that of the polynomial. With A_K = A - B K and adj(s I - A_K) = sum of s^(n-1-k) H_k,
 
@@ -48,9 +49,9 @@ def place(
 ) -> Float[Array, "m n"]:
     """Returns the gain K of u = -K s that gives A - B K these eigenvalues.
 
-    For one input see `place_polynomial`. For several inputs there are many such gains: without `directions` it is that of
-    `scipy.signal.place_poles`, whose eigenvalues are the least sensitive, outside jit and without a derivative; with them
-    it is differentiable, for poles that are no eigenvalues of A. The gain of an observer is that of the transposed
+    For one input see `place_polynomial`. For several inputs there are many such gains. Without `directions` it is that
+    of `scipy.signal.place_poles`, whose eigenvalues are the least sensitive, outside jit and without a derivative; with
+    them it is differentiable, for poles that are no eigenvalues of A. The gain of an observer is that of the transposed
     problem, place(A', C', poles)'.
 
     Args:

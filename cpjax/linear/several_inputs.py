@@ -45,8 +45,8 @@ def robust_gain(
         allowed = "known numbers, or else directions: the search for the most robust gain has no derivative"
         raise InputError("directions", None, allowed)
     wide = [np.asarray(matrix, dtype=np.float64) for matrix in (A, B)]
+    shaped("poles", jnp.asarray(poles), (len(A),))
     wanted = np.asarray(poles)
-    shaped("poles", wanted, (len(A),))
     if np.max(np.sum(wanted[:, None] == wanted, axis=0)) > np.linalg.matrix_rank(wide[1]):
         raise InputError("poles", poles, "each at most as often as B has independent columns")
     try:

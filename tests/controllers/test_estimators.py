@@ -45,7 +45,7 @@ def kalman_by_numpy(kind, measured, commands, T, Q, R, P):
     states, covariances, squares = [s], [P], []
     for y, u in zip(measured[1:], commands, strict=True):
         if kind == "extended":
-            A = np.stack([slope(lambda moved: midpoint(moved, u, T), s, h) for h in 1e-3 * np.eye(4)], axis=1)
+            A = np.stack([slope(lambda moved, u=u: midpoint(moved, u, T), s, h) for h in 1e-3 * np.eye(4)], axis=1)
         s, P = midpoint(s, u, T), A @ P @ A.T + Q
         S, error = C @ P @ C.T + R, y - C @ s
         squares.append(error @ np.linalg.solve(S, error))
