@@ -48,7 +48,6 @@ def cases(plant: cpjax.CartPole) -> dict[str, tuple[Any, Any]]:
 
 def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
     """Prints the table and writes sweep_on_a_rig.json."""
-    cpjax.configure_cpu()
     duration, laps, count = (0.1, 1, 64) if quick else (DURATION, 15, STARTS)
     starts = cpjax.sample_starts("hanging", count, seed=seed, dtype=np.float32)
     settings: dict[str, Any] = {"duration": duration, "dt": PERIOD, "control_period": PERIOD, "seed": seed}
@@ -96,4 +95,5 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
 
 
 if __name__ == "__main__":
+    cpjax.configure_cpu()
     run(main, __doc__ or "")
