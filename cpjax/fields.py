@@ -131,13 +131,14 @@ class Number:
 class Matrix:
     """Declaration of an array-valued field: its last axes have `shape`; axes before them are a batch.
 
-    None in `shape` stands for any length of at least 1.
+    None in `shape` stands for any length of at least 1. An `optional` field may be None, its default.
     """
 
     shape: tuple[int | None, ...]
     unit: str
     help: str
     symmetric: bool = False
+    optional: bool = False
 
     def allowed(self) -> str:
         kind = "symmetric finite" if self.symmetric else "finite"
@@ -145,6 +146,8 @@ class Matrix:
         return f"a {kind} array of shape {shape} [{self.unit}]"
 
     def normalise(self, name: str, value: Any) -> Any:
+        if value is None and self.optional:
+            return None
         if isinstance(value, (list, tuple)):
             value = jnp.asarray(value) if _holds_tracers(value) else _from_list(name, value, self.allowed())
         if not hasattr(value, "shape"):
@@ -183,7 +186,7 @@ class Count:
 
     help: str
     at_least: int = 0
-    at_most: float = 10_000_000  # beyond it what is counted would not fit in memory
+    at_most: int | float = 10_000_000  # beyond it what is counted would not fit in memory
     unit: str = ""
 
     def allowed(self) -> str:
@@ -223,9 +226,11 @@ def number(unit: str, help: str, *, default: Any = dataclasses.MISSING, **more: 
     return dataclasses.field(default=default, metadata={RULE: Number(unit, help, **more)})
 
 
-def matrix(shape: tuple[int | None, ...], unit: str, help: str, *, symmetric: bool = False) -> Any:
-    """Declares an array-valued field (see `Matrix`)."""
-    return dataclasses.field(metadata={RULE: Matrix(shape, unit, help, symmetric)})
+def matrix(
+    shape: tuple[int | None, ...], unit: str, help: str, *, symmetric: bool = False, default: Any = dataclasses.MISSING
+) -> Any:
+    """Declares an array-valued field (see `Matrix`); a `default` of None makes it optional."""
+    return dataclasses.field(default=default, metadata={RULE: Matrix(shape, unit, help, symmetric, default is None)})
 
 
 def part(help: str, *needs: str, default: Any = dataclasses.MISSING, default_factory: Any = dataclasses.MISSING) -> Any:

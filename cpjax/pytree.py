@@ -17,11 +17,15 @@ import numpy as np
 from cpjax.errors import InputError
 from cpjax.fields import (
     RULE,
+    Choice,
+    Count,
     JaxOrNumpy,
     Matrix,
     Number,
     Scalar,
     Scalars,
+    choice,
+    count,
     fits,
     is_traced,
     matrix,
@@ -43,6 +47,8 @@ __all__ = [
     "as_array",
     "cast",
     "check",
+    "choice",
+    "count",
     "hide",
     "is_component",
     "is_number",
@@ -60,9 +66,11 @@ __all__ = [
 T = TypeVar("T")
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=False, field_specifiers=(number, matrix, part))
+@dataclass_transform(frozen_default=True, kw_only_default=False, field_specifiers=(number, matrix, part, count, choice))
 def pytree(cls: type[T]) -> type[T]:
     """Makes a class a frozen dataclass that is registered with JAX and checked when a user constructs it.
+
+    Fields declared by `count` or `choice` are part of the tree's structure: constants of a compilation, and no leaves.
 
     Raises (from the constructor):
       InputError: a concrete value outside its declared range, not a number, or of the wrong shape or dtype.
@@ -77,18 +85,23 @@ def pytree(cls: type[T]) -> type[T]:
     cls.__post_init__ = post_init  # type: ignore[attr-defined]  # mypy does not see attributes added to a class
     # Equality stays identity: comparing fields that hold arrays has no single truth value.
     made: Any = dataclasses.dataclass(frozen=True, eq=False)(cls)
-    names = [field.name for field in dataclasses.fields(made)]
+    declared = rules(made)
+    constant = [name for name, rule in declared.items() if isinstance(rule, (Choice, Count))]
+    names = [field.name for field in dataclasses.fields(made) if field.name not in constant]
 
-    def flatten_with_keys(tree: Any) -> tuple[list[tuple[Any, Any]], None]:
-        return [(jax.tree_util.GetAttrKey(name), getattr(tree, name)) for name in names], None
+    def constants(tree: Any) -> tuple[Any, ...]:
+        return tuple(getattr(tree, name) for name in constant)
 
-    def flatten(tree: Any) -> tuple[list[Any], None]:
-        return [getattr(tree, name) for name in names], None
+    def flatten_with_keys(tree: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+        return [(jax.tree_util.GetAttrKey(name), getattr(tree, name)) for name in names], constants(tree)
 
-    def unflatten(_: None, leaves: Any) -> T:
+    def flatten(tree: Any) -> tuple[list[Any], tuple[Any, ...]]:
+        return [getattr(tree, name) for name in names], constants(tree)
+
+    def unflatten(constants: tuple[Any, ...], leaves: Any) -> T:
         # Bypasses __init__ and with it the checks: JAX's leaves may be anything.
         tree = object.__new__(made)
-        for name, value in zip(names, leaves, strict=True):
+        for name, value in (*zip(names, leaves, strict=True), *zip(constant, constants, strict=True)):
             object.__setattr__(tree, name, value)
         return tree
 
@@ -163,6 +176,8 @@ def _check_fields(name: str, tree: Any, batch: int | None) -> list[bool]:
         path, value, rule = f"{name}.{field.name}", getattr(tree, field.name), declared.get(field.name)
         if is_component(value):
             batched += _check_fields(path, value, batch)
+        elif isinstance(rule, (Choice, Count)) or (isinstance(rule, Matrix) and rule.optional and value is None):
+            rule.normalise(path, value)
         elif value is None and isinstance(rule, Number) and rule.optional:
             continue
         elif isinstance(rule, (Number, Matrix)) or (field.name in scalars and is_number(value)):

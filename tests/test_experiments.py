@@ -25,6 +25,7 @@ SLOW = {  # a minute of compiling each, or what the package's own tests hold any
     "reference_times",
     "riccati_accuracy",
     "sweep_against_measure",
+    "sweep_on_a_rig",
     "speed_against",
     "start_up",
     "success_table",

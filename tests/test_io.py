@@ -120,7 +120,9 @@ THINGS |= {
     "AccelerationActuator": cpjax.AccelerationActuator(10.0 / 3.0),
     "FilteredDerivative": cpjax.FilteredDerivative(100.0 / 3.0),
     "Observer": cpjax.Observer(PLANT, np.ones((4, 2)) / 3.0),
-    "Digital": cpjax.Digital(LAW, cpjax.FilteredDerivative(30.0), dead_band=0.1),
+    "Observer by poles": cpjax.Observer(PLANT, poles=[-20.0 + 3j, -20.0 - 3j, -30.0, -40.0], prediction="runge-kutta"),
+    "KalmanFilter": cpjax.KalmanFilter(PLANT, 1e-4 / 3.0, 1e-3, kind="extended"),
+    "Digital": cpjax.Digital(LAW, cpjax.Observer(PLANT, np.ones((4, 2)) / 3.0), dead_band=0.1, delay=2),
 }
 every_thing = rows("thing", THINGS.values(), ids=THINGS)
 both_formats = rows("extension", ["json", "toml"])

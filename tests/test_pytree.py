@@ -365,3 +365,22 @@ def test_an_old_name_of_a_field_works_and_warns():
         assert Run(h=0.5).step == 0.5
     with pytest.raises(TypeError):
         Run(g=0.5)
+
+
+def test_counts_and_choices_are_part_of_the_structure_and_no_leaves():
+    @pytree
+    class Repeated:
+        gain: float = number("1", "factor")
+        times: int = count("how often", default=2)
+        way: str = choice("in which way", ("up", "down"), default="up")
+
+        def value(self):
+            return self.gain**self.times * (1.0 if self.way == "up" else -1.0)
+
+    thing = Repeated(3.0)
+    assert jax.tree.leaves(thing) == [3.0]
+    assert jax.tree.structure(thing) != jax.tree.structure(Repeated(3.0, 3))
+    assert float(jax.jit(Repeated.value)(Repeated(3.0, way="down"))) == -9.0
+    assert float(jax.grad(Repeated.value)(thing).gain) == 6.0
+    with pytest.raises(InputError, match=r"Repeated\.way"):
+        Repeated(3.0, way="left")

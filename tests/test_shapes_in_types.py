@@ -89,6 +89,8 @@ def calls():
     words, seen = jnp.arange(3, dtype=jnp.uint32), State(one, one, one, one)
     lumped, actuator, servo = LumpedMotor(2.0), ForceActuator(), AccelerationActuator()
     filtered, observer = c.FilteredDerivative(10.0, period), c.Observer(plant, np.ones((4, 2)), period)
+    kinds = ("time-varying", "extended")
+    filters = {kind: c.KalmanFilter(plant, 1e-4, 1e-3, kind=kind, period=period) for kind in kinds}
     digital = c.Digital(law, filtered)
     integral, following = c.IntegralAction(law, 1.0, period=period), c.MovingReference(law, signal)
     pushed = Rig(CartPole(coulomb_friction=1.0), disturbance=Disturbance(wind=Wind(1.0)))
@@ -139,6 +141,9 @@ def calls():
         "linear.riccati.dare": call(0.1 * A, B, Q, R),
         "linear.riccati.solve_care": call(A, B, Q, R, N),
         "linear.riccati.solve_dare": call(0.1 * A, B, Q, R, N),
+        "linear.several_inputs.robust_gain": call(A, B, poles),
+        "linear.several_inputs.pole_directions": call(A, B, poles),
+        "linear.several_inputs.gain_by_directions": call(A, B, 2.0 * poles, jnp.ones((2, 5))),
         "linear.structure.Structure.full": call(Structure(A, mode, b, one)),
         "linear.structure.controllability_matrix": call(A, B),
         "linear.structure.observability_matrix": call(A, C),
@@ -268,15 +273,28 @@ def calls():
         "plant.state.State.from_vector": call(State, jnp.ones((3, 4))),
         "plant.state.deviation": call(state, state),
         "plant.state.checked_reference": call("reference", state),
-        "controllers.digital.FilteredDerivative.at_period": call(filtered, period),
-        "controllers.digital.FilteredDerivative.init": call(filtered, state),
-        "controllers.digital.FilteredDerivative.update": call(filtered, filtered.init(seen), seen, one),
-        "controllers.digital.Observer.at_period": call(observer, period),
-        "controllers.digital.Observer.init": call(observer, state),
-        "controllers.digital.Observer.update": call(observer, observer.init(seen), seen, one),
+        "controllers.estimators.FilteredDerivative.at_period": call(filtered, period),
+        "controllers.estimators.FilteredDerivative.init": call(filtered, state),
+        "controllers.estimators.FilteredDerivative.update": call(filtered, filtered.init(seen), seen, one),
+        "controllers.estimators.Observer.at_period": call(observer, period),
+        "controllers.estimators.Observer.init": call(observer, state),
+        "controllers.estimators.Observer.update": call(observer, observer.init(seen), seen, one),
+        "controllers.estimators.Observer.advance": call(observer, observer.init(seen), one),
+        "controllers.estimators.Observer.correct": call(observer, observer.init(seen), seen),
+        "controllers.estimators.Observer.predict": call(observer, seen, one),
+        "controllers.estimators.KalmanFilter.at_period": call(filters["time-varying"], period),
+        "controllers.estimators.KalmanFilter.steady_gain": call(filters["extended"], period),
+        "controllers.estimators.KalmanFilter.init": call(filters["extended"], state),
+        "controllers.estimators.KalmanFilter.update": call(
+            filters["extended"], filters["extended"].init(seen), seen, one
+        ),
+        "controllers.estimators.KalmanFilter.advance": call(filters["extended"], filters["extended"].init(seen), one),
+        "controllers.estimators.KalmanFilter.correct": call(filters["extended"], filters["extended"].init(seen), seen),
+        "controllers.estimators.KalmanFilter.predict": call(filters["extended"], seen, one),
+        "controllers.estimators.observer_gain": call(plant, pair, period),
         "controllers.digital.Digital.init": call(digital, state),
         "controllers.digital.Digital.update": call(digital, digital.init(seen), seen),
-        "controllers.digital.kalman_observer": call(plant, period=0.01, x_deviation=1e-4, theta_deviation=1e-3),
+        "controllers.estimators.kalman_observer": call(plant, period=0.01, x_deviation=1e-4, theta_deviation=1e-3),
         "controllers.energy.EnergySwingUp.acceleration": call(swing_up, state),
         "controllers.energy.EnergySwingUp.voltage": call(swing_up, state),
         "controllers.feedback.LqrWeights.solve": call(weights, P, jnp.ones((4, 1))),
@@ -326,6 +344,8 @@ def calls():
 
 NOT_TRACED = (
     "kalman_observer",
+    "robust_gain",
+    "pole_directions",
     "standard_normals",
     "numeric.differences",
     "numeric.pareto",

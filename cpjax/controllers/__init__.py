@@ -1,7 +1,8 @@
 """Controllers: laws, gates (switching regions), and the hybrid controller that combines them."""
 
-from cpjax.controllers.digital import Digital, Estimator, FilteredDerivative, Observer, kalman_observer
+from cpjax.controllers.digital import Digital, Estimator
 from cpjax.controllers.energy import EnergySwingUp
+from cpjax.controllers.estimators import FilteredDerivative, KalmanFilter, Observer, kalman_observer
 from cpjax.controllers.feedback import Design, DesignName, LqrWeights, PoleFactors, StateFeedback
 from cpjax.controllers.gates import AngleGate, AngleRateGate, Gate, LyapunovGate
 from cpjax.controllers.hybrid import Hybrid
@@ -39,6 +40,7 @@ __all__ = [
     "Gate",
     "Hybrid",
     "IntegralAction",
+    "KalmanFilter",
     "Law",
     "LqrWeights",
     "LyapunovGate",

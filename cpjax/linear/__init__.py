@@ -25,6 +25,7 @@ from cpjax.linear.margins import (
 )
 from cpjax.linear.placement import QuadraticFactors, place, place_polynomial, polynomial_from_poles
 from cpjax.linear.riccati import RiccatiSolution, care, dare
+from cpjax.linear.several_inputs import pole_directions
 from cpjax.linear.structure import (
     POSITION_AND_ANGLE,
     Structure,
@@ -68,6 +69,7 @@ __all__ = [
     "observability_matrix",
     "place",
     "place_polynomial",
+    "pole_directions",
     "polynomial_from_poles",
     "saturation_angle",
     "stability_margins",

@@ -1,8 +1,9 @@
-"""Pole placement for one input, and a parametrisation of stable polynomials that is smooth everywhere.
+"""Pole placement, and a parametrisation of stable polynomials that is smooth everywhere.
 
-The gain is Ackermann's (1972): K = e_n' C^-1 p(A), with C the controllability matrix and p the desired characteristic
-polynomial. The formula is known for losing digits; here it is evaluated in double-word arithmetic and loses none. It
-takes a polynomial, not poles, so that repeated poles need no special treatment.
+For several inputs see `several_inputs.py`. For one input the gain is Ackermann's (1972): K = e_n' C^-1 p(A), with C the
+controllability matrix and p the desired characteristic polynomial. The formula is known for losing digits; here it is
+evaluated in double-word arithmetic and loses none. It takes a polynomial, not poles, so that repeated poles need no
+special treatment.
 
 The derivative follows from that of the polynomial. With A_K = A - B K and adj(s I - A_K) = sum of s^(n-1-k) H_k,
 
@@ -23,7 +24,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Num, Real
 
 from cpjax.errors import InputError
-from cpjax.linear.arguments import MatrixLike, column, matrices, shaped, square
+from cpjax.linear.arguments import MatrixLike, column, columns, matrices, shaped, square
+from cpjax.linear.several_inputs import gain_by_directions, robust_gain
 from cpjax.numeric import double_word as dw
 from cpjax.numeric.double_word import DoubleWord, double_word
 from cpjax.numeric.small_matrices import (
@@ -41,15 +43,23 @@ from cpjax.pytree import is_traced
 
 def place(
     A: Real[MatrixLike, "n n"],
-    B: Real[MatrixLike, "n 1"] | Real[MatrixLike, " n"],
+    B: Real[MatrixLike, "n m"] | Real[MatrixLike, " n"],
     poles: Num[ArrayLike, " n"] | Sequence[complex],
-) -> Float[Array, "1 n"]:
-    """Returns the gain K of u = -K s that gives A - B K these eigenvalues; see `place_polynomial`.
+    directions: Num[ArrayLike, "m n"] | None = None,
+) -> Float[Array, "m n"]:
+    """Returns the gain K of u = -K s that gives A - B K these eigenvalues.
+
+    For one input see `place_polynomial`. For several inputs there are many such gains. Without `directions` it is that
+    of `scipy.signal.place_poles`, whose eigenvalues are the least sensitive, outside jit and without a derivative; with
+    them it is differentiable, for poles that are no eigenvalues of A. The gain of an observer is that of the transposed
+    problem, place(A', C', poles)'.
 
     Args:
       A: state matrix [1/s].
-      B: input matrix of one input.
-      poles: real or in complex conjugate pairs, in any order, repeated or not [1/s].
+      B: input matrix.
+      poles: real or in complex conjugate pairs, in any order, repeated or not; for several inputs at most as often as B
+        has independent columns [1/s].
+      directions: K times the eigenvector of each pole, such as `cpjax.linear.pole_directions`; for several inputs only.
 
     Raises:
       InputError: shapes that do not fit, concrete poles that are not closed under conjugation, or a concrete pair
@@ -58,6 +68,11 @@ def place(
     A, B = matrices(A=A, B=B)
     coefficients = polynomial_from_poles(poles)
     shaped("poles", coefficients, (square("A", A),))
+    if B.ndim == 2 and B.shape[1] > 1:
+        B = columns("B", B, len(A))
+        return robust_gain(A, B, poles) if directions is None else gain_by_directions(A, B, poles, directions)
+    if directions is not None:
+        raise InputError("directions", directions, "left out for one input, whose gain follows from the poles")
     return place_polynomial(A, B, coefficients.astype(A.dtype))
 
 

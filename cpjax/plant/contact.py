@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from cpjax.plant.cartpole import CartPole, Pair
+from cpjax.plant.cartpole import Pair
 from cpjax.plant.motor import AccelerationActuator
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, part, pytree
@@ -244,11 +244,11 @@ class InContact:
         return right, left
 
 
-def in_contact(plant: CartPole, half_length: Scalar | None = None, restitution: Scalar = 0.0) -> CartPole | InContact:
+def in_contact(plant: Any, half_length: Scalar | None = None, restitution: Scalar = 0.0) -> Any:
     """Returns a plant as the loop integrates it: unchanged if it has neither dry friction nor stops.
 
     Args:
-      plant: the cart-pole.
+      plant: the cart-pole, bare or on the bench.
       half_length: of a track with stops at its ends [m]; None for no stops.
       restitution: speed of the cart after a stop to that before [1].
     """

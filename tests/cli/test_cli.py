@@ -192,6 +192,8 @@ CASES = [
     *({f"plant.{name}": 2.5} for name in ("cart_friction", "pivot_friction", "torque_constant", "back_emf_constant")),
     *({f"plant.{name}": 2.5} for name in ("resistance", "rotor_inertia", "viscous_friction", "wheel_radius")),
     *({f"plant.{name}": 2.5} for name in ("gear_ratio", "voltage_limit")),
+    *({f"plant.{name}": 0.5} for name in ("coulomb_friction", "pivot_coulomb_friction", "inductance")),
+    {"plant.static_friction_ratio": 1.5, "plant.coulomb_friction": 0.5},
     {"plant.voltage_limit": math.inf},
     *({"controller.law": law} for law in ("as-printed", "corrected", "corrected-as-voltage")),
     {"controller.design": "lqr"},

@@ -6,12 +6,15 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from jax import lax
 from oracles import jacobian, relative_error
+from scipy.linalg import expm
 from scipy.signal import place_poles
 from tables import rows
 
 from cpjax import InputError, linearize, paper
 from cpjax.linear.placement import QuadraticFactors, place, place_polynomial, polynomial_from_poles
+from cpjax.linear.several_inputs import pole_directions
 
 A, B = (np.asarray(matrix) for matrix in linearize(paper.appendix_plant()))
 POLES = np.array(paper.POLES)
@@ -104,6 +107,69 @@ def test_distinct_poles_are_placed_as_scipy_places_them(n):
             -np.linspace(1.0, 4.0, n) - rng.uniform(size=n) / 4,
         )
         assert relative_error(place(a, b, poles), place_poles(a, b, poles).gain_matrix) <= 1e-8
+
+
+SEVERAL = [(4, 2), (5, 3), (3, 3)]
+
+
+@rows(("n", "m"), SEVERAL)
+def test_poles_are_placed_by_several_inputs_as_python_control_places_them(n, m):
+    rng = np.random.default_rng(10 * n + m)
+    a, b = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    for poles in (np.array([-1.5 + 2j, -1.5 - 2j, -3.0, -3.0, -4.0][:n]), -np.linspace(1.0, 4.0, n)):
+        K = place(a, b, poles)
+        assert K.shape == (m, n)
+        found = np.poly(a - b @ np.asarray(K))
+        np.testing.assert_allclose(found, np.poly(poles).real, rtol=1e-9)
+        assert relative_error(K, control.place(a, b, poles)) <= 1e-9
+        # A pole that has come twice may be found as a pair, and its eigenvectors are any of a plane.
+        again = place(a, b, poles, directions=pole_directions(a, b, poles))
+        np.testing.assert_allclose(np.poly(a - b @ np.asarray(again)), found, rtol=1e-6)
+    assert np.max(np.abs(np.sort(np.linalg.eigvals(a - b @ np.asarray(K)).real) - np.sort(poles))) <= 1e-9
+    assert relative_error(again, K) <= 1e-9
+
+
+def test_an_observer_of_two_outputs_is_the_transposed_problem():
+    a, c = expm(0.01 * A), np.eye(4)[[0, 2]]
+    poles = np.exp(-0.01 * np.array([20.0, 22.0, 25.0, 30.0]))
+    L = np.asarray(place(a.T, c.T, poles)).T
+    np.testing.assert_allclose(np.sort(np.linalg.eigvals(a - L @ c)), np.sort(poles), rtol=1e-9)
+
+
+def test_with_directions_the_gain_of_several_inputs_has_derivatives():
+    rng = np.random.default_rng(5)
+    a, b = rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
+    poles = jnp.array([-1.5 + 2j, -1.5 - 2j, -3.0, -4.0])
+    G = pole_directions(a, b, poles)
+
+    def gain(x):
+        moved = lax.complex(x[jnp.array([0, 0, 2, 3])], jnp.stack([x[1], -x[1], 0.0 * x[2], 0.0 * x[3]]))
+        return place(x[4:20].reshape(4, 4), x[20:].reshape(4, 2), moved, directions=G).ravel()
+
+    x = jnp.concatenate([jnp.array([-1.5, 2.0, -3.0, -4.0]), a.ravel(), b.ravel()])
+    expected = jacobian(jax.jit(jax.vmap(gain)), x, 1e-3)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(gain))(x), expected, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(gain))(x), expected, rtol=1e-7, atol=1e-7)
+
+
+@rows(
+    ("field", "arguments"),
+    [
+        ("poles", (A, np.eye(4)[:, :2], [-3.0, -3.0, -3.0, -4.0])),
+        ("directions", (A, B, POLES, np.ones((1, 4)))),
+        ("directions", (A, np.eye(4)[:, :2], POLES, np.ones((1, 4)))),
+        ("B", (np.diag([1.0, 2.0, 3.0, 4.0]), np.eye(4)[:, :2], POLES)),
+    ],
+)
+def test_what_several_inputs_cannot_place_is_refused(field, arguments):
+    with pytest.raises(InputError) as caught:
+        place(*arguments)
+    assert caught.value.field == field
+
+
+def test_the_search_for_a_robust_gain_is_refused_inside_jit():
+    with pytest.raises(InputError, match="directions"):
+        jax.jit(place)(A, np.eye(4)[:, :2], POLES)
 
 
 def test_order_dtype_and_container_of_the_poles_do_not_matter():
