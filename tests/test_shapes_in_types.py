@@ -343,6 +343,9 @@ def calls():
 
 
 NOT_TRACED = (
+    "IntegralAction.designed",
+    "MovingReference.square_wave",
+    "MovingReference.from_file",
     "kalman_observer",
     "robust_gain",
     "pole_directions",

@@ -12,7 +12,7 @@ from cpjax.cli.output import complain
 from cpjax.controllers import StateFeedback
 from cpjax.plant import CartPole
 from cpjax.presets import differences, model_differences
-from cpjax.pytree import numbers
+from cpjax.pytree import present
 from cpjax.rig import PRESETS as RIGS
 
 _SUPPLY = "voltage_limit"
@@ -35,7 +35,7 @@ def notes_on(given: Mapping[str, Any], plant: CartPole, controllers: Mapping[str
 
 def plant_notes(given: Mapping[str, Any], plant: CartPole) -> list[str]:
     """Returns a note with the fields that were left at their defaults, if a motor was given in part."""
-    declared = numbers(type(plant.motor))
+    declared = present(plant.motor)
     stated = {key for key in declared if key in given}
     base = given.get("rig", given.get("base", "appendix"))
     whose = f"the {base} plant's"

@@ -12,7 +12,7 @@ import tomli_w
 
 from cpjax import io
 from cpjax.errors import printable
-from cpjax.fields import Choice, Part, rules
+from cpjax.fields import Choice, Part, numbers, rules
 from cpjax.rig import Rig
 
 _WIDTH = 100
@@ -46,6 +46,8 @@ def _table(path: str, thing: Any) -> Iterator[str]:
         yield from _comment(_summary(type(thing)))
         yield f"[{path}]"
     yield from _rows({key: _toml(value) for key, value in values.items()}, type(thing))
+    absent = {key: "?" for key in numbers(type(thing)) if getattr(thing, key) is None}
+    yield from ("# " + row for row in _rows(absent, type(thing)))
     for field in dataclasses.fields(thing):
         below = f"{path}.{field.name}" if path else field.name
         part, kind = getattr(thing, field.name), _optional_component(type(thing), field.name)
@@ -71,12 +73,14 @@ def _absent(path: str, kind: type) -> Iterator[str]:
     yield from _comment(_summary(kind))
     yield f"# [{path}]"
     yield from ("# " + row for row in _rows(values, kind))
+    absent = {key: "?" for key in numbers(kind) if key not in values}
+    yield from ("# # " + row for row in _rows(absent, kind))
 
 
 def _rows(values: dict[str, str], kind: type) -> Iterator[str]:
     """Yields `key = value`, with what a declaration says of the field as a comment beside it."""
     texts = {key: f"{key} = {value}" for key, value in values.items()}
-    column = min(_COLUMN, max(map(len, texts.values())))
+    column = min(_COLUMN, max(map(len, texts.values()), default=0))
     for key, text in texts.items():
         rule = rules(kind).get(key)
         if rule is None:

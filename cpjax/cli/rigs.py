@@ -10,7 +10,7 @@ from cpjax import io
 from cpjax.cli.builders import build_plant
 from cpjax.cli.options import Option, options_of
 from cpjax.controllers import Digital, FilteredDerivative
-from cpjax.controllers.digital import kalman_observer
+from cpjax.controllers.estimators import kalman_observer
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, with_parameters
 from cpjax.pytree import Number

@@ -239,7 +239,7 @@ def _left_out(rig: Rig) -> list[str]:
         found.append("efficiencies of gear and motor are taken as 1, unless the force per voltage has them")
     if not math.isfinite(float(plant.input_limit)):
         found.append("the command has no limit: every catch succeeds that a real supply may not give")
-    friction = [name for name in numbers(type(plant)) if "friction" in name and not float(getattr(plant, name))]
+    friction = [name for name in numbers(type(plant)) if name.endswith("friction") and not getattr(plant, name)]
     if friction:
         found.append(f"no {' and no '.join(name.replace('_', ' ') for name in friction)}")
     if not float(plant.pole_inertia):
@@ -256,4 +256,4 @@ def _left_out(rig: Rig) -> list[str]:
 
 
 def _is_zero(value: Any) -> bool:
-    return np.ndim(value) == 0 and float(value) == 0.0
+    return value is None or (np.ndim(value) == 0 and float(value) == 0.0)

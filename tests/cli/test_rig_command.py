@@ -13,6 +13,7 @@ import cpjax.show.figures
 from cpjax import (
     CartPole,
     Digital,
+    Disturbance,
     Drive,
     Encoders,
     FilteredDerivative,
@@ -91,7 +92,7 @@ def test_parts_that_a_rig_lacks_are_there_to_be_uncommented(tmp_path):
     below = [line for line in text[begin:].splitlines() if " = " in line or "# [" in line]
     filled = "\n".join(line.removeprefix("# ").replace("?", "0.25") for line in below)
     (tmp_path / "rig.toml").write_text(text[:begin] + filled, encoding="utf-8")
-    expected = Rig(FULL.plant, Encoders(x_step=0.25, theta_step=0.25), Drive(), Track(0.25))
+    expected = Rig(FULL.plant, Encoders(x_step=0.25, theta_step=0.25), Drive(), Track(0.25), Disturbance())
     assert io.encode(load(tmp_path / "rig.toml")) == io.encode(expected)
 
 
