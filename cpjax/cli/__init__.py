@@ -38,6 +38,7 @@ _COMMANDS = (
     "tune",
     "compare",
     "basin",
+    "robustness",
     "pareto",
     "animate",
     "rig",

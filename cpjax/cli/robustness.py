@@ -1,0 +1,197 @@
+"""`cpjax robustness`: the robustness cards of controllers on one rig, as a table, a picture and JSON."""
+
+import argparse
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from cpjax import files, io
+from cpjax.cli.builders import PLANT_OPTIONS, controller_title, named_hybrid
+from cpjax.cli.notes import announce, notes_on
+from cpjax.cli.options import Option, add_options, options_of, resolve
+from cpjax.cli.output import say
+from cpjax.cli.progress import progress
+from cpjax.cli.rigs import BARE, FIRMWARE_OPTIONS, RIG_OPTIONS, Firmware, build_firmware, build_rig, with_usual_period
+from cpjax.cli.tables import print_table
+from cpjax.controllers import Hybrid
+from cpjax.errors import InputError
+from cpjax.plant import CartPole
+from cpjax.rig import Rig, plant_of
+from cpjax.study.robustness import RobustnessCard, RobustnessConfig, duration_of, robustness_card, target_bands
+
+CONTROLLERS = ("corrected-centred/lqr", "corrected-centred/placement", "tuned_lqr", "tuned_place")
+_PICTURE, _JSON = "robustness.png", "robustness.json"
+
+OPTIONS = [
+    Option(
+        "card",
+        "controllers",
+        "one card each: tuned_lqr, tuned_place, a file, or a law of the paper with its regulator, such as "
+        "corrected/lqr/computed (default " + " ".join(CONTROLLERS) + ")",
+        count="+",
+    ),
+    *(
+        option
+        for option in options_of("card", RobustnessConfig, defaults=True)
+        if option.key not in ("seed", "control_period")
+    ),
+    *PLANT_OPTIONS,
+    *RIG_OPTIONS,
+    *FIRMWARE_OPTIONS,
+]
+
+
+def add_command(commands: Any) -> None:
+    """Declares the command."""
+    text = (
+        "How far a rig may differ from the one that a controller was made for: success rates over grids of wrong "
+        "parameters, noise, lag, delay and pushes, and with all parameters wrong at once. Controllers are compared on "
+        f"one rig, never across rigs. Writes {_PICTURE} and {_JSON}."
+    )
+    parser = commands.add_parser("robustness", help="what a controller bears, on one rig", description=text)
+    add_options(parser, OPTIONS, out="out/robustness")
+    parser.set_defaults(run=run, many_starts=True)
+
+
+def run(given: argparse.Namespace) -> int:
+    """Runs the command."""
+    sections = resolve(given, OPTIONS)
+    rig = build_rig(sections["plant"])
+    plant = plant_of(rig)
+    chosen = dict(sections["card"])
+    names = chosen.pop("controllers", list(CONTROLLERS))
+    if len(set(names)) < len(names):
+        raise InputError("controllers", names, "each one once")
+    controllers = {name: named_hybrid(name, plant) for name in names}
+    estimation = dict(sections["firmware"])
+    stated = {key: chosen[key] for key in ("dt",) if key in chosen}
+    if "control_period" in estimation:
+        stated["control_period"] = estimation.pop("control_period")
+    timing = with_usual_period({"dt": 0.002, **stated}, stated, sections["plant"])
+    firmware = build_firmware(estimation, rig, timing, given.seed)
+    period = timing.get("control_period", timing["dt"])
+    settings = RobustnessConfig(seed=given.seed, control_period=period, **{**chosen, "dt": timing["dt"]})
+    notes = [*notes_on(sections["plant"], plant, controllers), *firmware.notes]
+    announce("robustness", notes)
+    begin = time.perf_counter()
+    cards, _ = run_robustness(given.out, rig, controllers, settings, notes, firmware)
+    seconds = time.perf_counter() - begin
+    print_table(*table(cards), text_columns=1)
+    angle, position = target_bands(rig if isinstance(rig, Rig) else Rig(rig))
+    runs = sum(runs_of(card) for card in cards.values())
+    say(
+        f"Settled: within {angle:g} rad and {position:g} m, at least 1 s before the end of "
+        f"{duration(rig, settings):g} s. {runs:,} runs in {seconds:.1f} s, compilation and files included.",
+        f"wrote {given.out / _JSON} and {given.out / _PICTURE}",
+    )
+    return 0
+
+
+def duration(rig: Rig | CartPole, settings: RobustnessConfig) -> float:
+    """Returns the length of each run [s]."""
+    return duration_of(rig if isinstance(rig, Rig) else Rig(rig), settings.dt)
+
+
+def run_robustness(
+    out: Path,
+    rig: Rig | CartPole,
+    controllers: Mapping[str, Hybrid],
+    settings: RobustnessConfig,
+    notes: Sequence[str] = (),
+    firmware: Firmware = BARE,
+) -> tuple[dict[str, RobustnessCard], bytes]:
+    """Computes the cards and writes JSON and picture; the JSON after each controller.
+
+    Args:
+      out: the folder.
+      rig: the rig, or a plant alone.
+      controllers: by name.
+      settings: the grids.
+      notes: for the JSON.
+      firmware: what runs around each controller.
+
+    Returns:
+      The cards by the controllers' titles, and the picture.
+    """
+    cards: dict[str, RobustnessCard] = {}
+    described: dict[str, Any] = {}
+    with progress("robustness") as report:
+        for name, controller in controllers.items():
+            title = controller_title(name)
+
+            def tell(grid: str, done: int, total: int, title: str = title) -> None:
+                report(done, total, f"{title}: {grid}")
+
+            cards[title] = robustness_card(rig, firmware(controller), settings, progress=tell)
+            described[name] = {"title": title, "controller": io.encode(controller), **document(cards[title])}
+            whole = {
+                "what": "robustness cards",
+                "versions": files.versions(),
+                "settings": {key: getattr(settings, key) for key in settings.__dataclass_fields__},
+                **io.encode_bench(rig),
+                **firmware.entries(),
+                "notes": list(notes),
+                "complete": len(described) == len(controllers),
+                "cards": described,
+            }
+            files.write_json(out / _JSON, whole)
+
+    from cpjax.show.figures import save_figure
+    from cpjax.show.robustness import robustness_figure
+
+    return cards, save_figure(out / _PICTURE, robustness_figure(cards))
+
+
+def document(card: RobustnessCard) -> dict[str, Any]:
+    """Returns a card as plain values, for JSON."""
+
+    def grid(one: Any) -> dict[str, Any]:
+        return {
+            "name": one.name,
+            "unit": one.unit,
+            "values": one.values.tolist(),
+            "successes": one.successes.tolist(),
+            "trials": one.trials,
+            "intervals": one.intervals.tolist(),
+        }
+
+    return {
+        "nominal": grid(card.nominal),
+        "criteria": {
+            one.name: {
+                "title": one.title,
+                "score": one.score,
+                "interval": list(one.interval),
+                "grids": [grid(each) for each in one.grids],
+            }
+            for one in card.criteria
+        },
+        "together": grid(card.together),
+    }
+
+
+def runs_of(card: RobustnessCard) -> int:
+    """Returns the number of runs of a card."""
+    return card.nominal.trials + card.together.trials + sum(criterion.runs for criterion in card.criteria)
+
+
+def table(cards: Mapping[str, RobustnessCard]) -> tuple[str, list[str], list[list[str]]]:
+    """Returns title, header and rows of the printed table."""
+    title = "Success rates [%]: means over the grid of each criterion; plus or minus half of the 95 % interval"
+
+    def shown(rate: float, interval: Sequence[float]) -> str:
+        return f"{100 * rate:.1f} ± {50 * (interval[1] - interval[0]):.1f}"
+
+    first = next(iter(cards.values()))
+    header = ["controller", "as it is", *(one.title for one in first.criteria), "all parameters wrong"]
+    rows = [
+        [
+            name,
+            shown(card.nominal.rates[0], card.nominal.intervals[0]),
+            *(shown(one.score, one.interval) for one in card.criteria),
+            shown(card.together.rates[0], card.together.intervals[0]),
+        ]
+        for name, card in cards.items()
+    ]
+    return title, header, rows
