@@ -103,6 +103,15 @@ class ImportedModel:
     upright: float
     left_out: tuple[str, ...]
 
+    def notes(self) -> list[str]:
+        """Returns in words how the joints relate to x and theta, and what was left out."""
+        sign = {1.0: "", -1.0: "-"}
+        return [
+            f"x = {sign[self.x_sign]}(slide - {self.x_origin:g}), theta = {sign[self.theta_sign]}(hinge - "
+            f"{self.upright:g}); here a positive theta leans towards negative x",
+            *(f"left out: {one}" for one in self.left_out),
+        ]
+
     def state(self, positions: tuple[Scalars, Scalars], rates: tuple[Scalars, Scalars] = (0.0, 0.0)) -> State:
         """Returns the state of the joints' coordinates.
 

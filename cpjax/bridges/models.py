@@ -16,11 +16,11 @@ def load_model(path: str | Path) -> ImportedModel:
 
     The file has two moving joints: a slide, whose bodies are the cart, and on it a hinge, whose bodies are the pole.
     Masses and inertias come from <inertial>, or in MJCF from the geoms, as MuJoCo's compiler computes them. The slide's
-    range becomes the track and the middle of it x = 0; damping and dry friction of the joints become
-    the plant's; the armature of
-    the slide is the drive's reflected mass, that of the hinge is part of the pole's inertia. The command keeps its
-    meaning: it is MuJoCo's control, a `LumpedMotor` with the motor's gear as force per command, or a `ForceActuator`
-    where the gear is 1. In URDF it is a force up to the limit's effort, and gravity is 9.81 m/s^2 along -z.
+    range becomes the track and the middle of it x = 0; damping and dry friction of the joints become the plant's; the
+    armature of the slide is the drive's reflected mass, that of the hinge is part of the pole's inertia. The command
+    keeps its meaning: it is MuJoCo's control, a `LumpedMotor` with the motor's gear as force per command, or a
+    `ForceActuator` where the gear is 1. In URDF it is a force up to the limit's effort, and gravity is 9.81 m/s^2 along
+    -z.
 
     Contacts, the hinge's range (see `ImportedModel.left_out`), sensors and the integrator's settings are not read.
     MuJoCo stops the cart at an end of its range, softly; here a run ends there (`Track.ends` can be "stop").

@@ -2,9 +2,12 @@
 
 import argparse
 import math
+from pathlib import Path
 from typing import Any
 
 from cpjax import files
+from cpjax.bridges.models import load_model
+from cpjax.bridges.mujoco import save_mjcf
 from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import complain, say
 from cpjax.cli.rig_file import rig_text
@@ -13,6 +16,7 @@ from cpjax.cli.tables import print_table
 from cpjax.rig import PRESETS
 from cpjax.study.rig_check import Figure, RigCheck, check_rig, document
 
+_READ = "Numbers are in SI units. --rig of cpjax's commands and cpjax.load read this file."
 _PERIOD = 0.002  # control period of the other commands [s]
 
 CHECK_OPTIONS = [
@@ -46,6 +50,21 @@ def add_command(commands: Any) -> None:
     add_options(checked, CHECK_OPTIONS, out="out/rig")
     checked.set_defaults(run=run_check, many_starts=True)
 
+    text = (
+        "Reads a cart-pole from a MuJoCo (MJCF) or URDF file and prints it as a TOML file with comments, for "
+        "`cpjax rig import cartpole.xml > mine.toml`. MJCF needs the package mujoco. Notes say how the file's joints "
+        "relate to x and theta."
+    )
+    imported = actions.add_parser("import", help="a cart-pole of another simulator as a file", description=text)
+    imported.add_argument("file", metavar="FILE", help="an MJCF (.xml) or URDF file")
+    imported.set_defaults(run=run_import)
+
+    text = "Writes a rig's plant, drive and track as a MuJoCo (MJCF) file. Its sensors are left out."
+    exported = actions.add_parser("export", help="a rig as a MuJoCo file", description=text)
+    _add_name(exported)
+    exported.add_argument("--out", type=Path, default=Path("out/rig"), help="folder for rig.xml (default out/rig)")
+    exported.set_defaults(run=run_export)
+
 
 def _add_name(parser: Any) -> None:
     parser.add_argument("name", metavar="NAME|FILE", help=f"{', '.join(PRESETS)}, or a file with a rig or a cart-pole")
@@ -65,13 +84,30 @@ def run_show(given: argparse.Namespace) -> int:
     return 0
 
 
+def run_import(given: argparse.Namespace) -> int:
+    """Runs `cpjax rig import`."""
+    model = load_model(given.file)
+    for note in model.notes():
+        complain(f"cpjax rig: note: {note}")
+    heading = [f"The cart-pole of {given.file}.", *model.notes(), _READ]
+    say(*rig_text(model.rig, heading).splitlines())
+    return 0
+
+
+def run_export(given: argparse.Namespace) -> int:
+    """Runs `cpjax rig export`."""
+    path = given.out / "rig.xml"
+    save_mjcf(path, load_rig(given.name))
+    say(f"wrote {path}")
+    return 0
+
+
 def _heading(name: str) -> list[str]:
-    read = "Numbers are in SI units. --rig of cpjax's commands and cpjax.load read this file."
     if name not in PRESETS:
-        return [f"The rig of {name}.", read]
+        return [f"The rig of {name}.", _READ]
     one = PRESETS[name]
     usual = f"Usual control period: {one.period:g} s, which a file does not hold: --control-period {one.period:g}."
-    return [f"{name}. Source: {one.source}.", f"Note: {one.note}.", usual, read]
+    return [f"{name}. Source: {one.source}.", f"Note: {one.note}.", usual, _READ]
 
 
 def run_check(given: argparse.Namespace) -> int:

@@ -389,3 +389,25 @@ def test_a_drive_of_another_kind_that_moves_the_cart_alike_is_the_papers_plant()
     lumped = LumpedMotor(float(motor.force_per_voltage), float(motor.damping), float(motor.reflected_mass))
     assert papers_own(dataclasses.replace(plant, motor=lumped)) == "appendix"
     assert papers_own(dataclasses.replace(plant, motor=ForceActuator(12.0))) is None
+
+
+# --- other simulators' files ------------------------------------------------------------------------------------------
+
+
+def test_a_rig_goes_to_mujocos_format_and_comes_back_as_a_file_with_comments(command, tmp_path):
+    pytest.importorskip("mujoco")
+    done = command("rig", "export", "dm-control", "--out", tmp_path)
+    assert (done.code, done.err) == (0, "")
+    result = command("rig", "import", tmp_path / "rig.xml")
+    assert result.code == 0
+    assert "theta = " in result.err
+    (tmp_path / "mine.toml").write_text(result.out, encoding="utf-8")
+    back, made = load(tmp_path / "mine.toml"), named_rig("dm-control")
+    for name, rule in numbers(CartPole).items():
+        one, other = getattr(back.plant, name), getattr(made.plant, name)
+        assert (one == other is None) or float(one) == pytest.approx(float(other), rel=1e-9), (name, rule)
+    assert float(back.track.half_length) == pytest.approx(float(made.track.half_length))
+    (tmp_path / "no.xml").write_text("<sdf/>")
+    refused = command("rig", "import", tmp_path / "no.xml")
+    assert refused.code == 2
+    assert "root element = 'sdf'" in refused.err
