@@ -253,7 +253,11 @@ def controller_title(name: str) -> str:
 
         rest = (DESIGN_NAMES.get(one, f"{one} gains") for one in others)
         return ", ".join([f"paper, {law.replace('-', ' ')}", *rest])
-    known = {"tuned_lqr": "tuned, LQR", "tuned_place": "tuned, pole placement"}
+    known = {
+        "tuned_lqr": "tuned, LQR",
+        "tuned_place": "tuned, pole placement",
+        "tuned_quanser_ip02_long": "tuned for quanser-ip02-long, LQR",
+    }
     return known.get(name, name if len(name) <= _LONG_NAME else "..." + name[3 - _LONG_NAME :])
 
 

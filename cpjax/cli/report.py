@@ -94,6 +94,8 @@ def write_report(
     sections_of.comparison(page, results, shown_start, drawn)
     if studies != "none":
         sections_of.animation(page, given)
+    if studies != "none":
+        sections_of.bench(page, given, studies)
     if per_axis:
         sections_of.basins(page, given, parts, per_axis)
     if studies != "none":

@@ -1,24 +1,29 @@
 """The sections of the report, each from a study that another command does too."""
 
 import argparse
+import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from cpjax import __version__, files, paper
-from cpjax.cli import basin, pareto
+from cpjax import __version__, files, io, paper
+from cpjax.cli import basin, pareto, robustness
 from cpjax.cli.animate import run_animation, verdict
 from cpjax.cli.audit_gradients import run_audit
 from cpjax.cli.builders import controller_title, named_hybrid
 from cpjax.cli.progress import progress
+from cpjax.cli.rigs import build_firmware
 from cpjax.cli.tune import run_tuning
 from cpjax.controllers import AngleGate
 from cpjax.paper.comparison import Compared
 from cpjax.paper.gain_identification import audit_gains, write
 from cpjax.paper.printed_gains import printed_in_the_paper
 from cpjax.paper.reproduction import DESIGNS, EvaluationConfig
+from cpjax.plant import CartPole
 from cpjax.plant.state import HANGING
 from cpjax.presets import preset
+from cpjax.rig import Drive, Encoders, Rig
 from cpjax.show import comparison as comparison_text
 from cpjax.show import design as design_text
 from cpjax.show import front as front_text
@@ -29,6 +34,7 @@ from cpjax.show.figures import DESIGN_NAMES, save_figure
 from cpjax.show.page import Page
 from cpjax.study.design_check import check_design, document
 from cpjax.study.fronts.config import FrontConfig
+from cpjax.study.robustness import RobustnessConfig
 from cpjax.tune.baseline import baseline
 from cpjax.tune.config import TuningConfig
 from cpjax.tune.parameters import free_parameters
@@ -44,6 +50,10 @@ QUICK_FRONTS: Mapping[str, Any] = {
 """Fields of a `FrontConfig`."""
 QUICK_TUNING: Mapping[str, Any] = {"candidates": 1023, "restarts": 4, "batch": 8, "steps": 36}
 """Fields of a `TuningConfig`."""
+QUICK_CARD: Mapping[str, Any] = {"values": 5, "starts": 50, "rigs": 200}
+"""Fields of a `RobustnessConfig`."""
+QUICK_CARDS = ("corrected-centred/placement", "tuned_lqr")
+"""Controllers of the quick cards."""
 QUICK_AUDIT: Mapping[str, Any] = {"count": 4, "duration": 3.0, "dt": 0.002}
 """Options of `cpjax audit-gradients`."""
 AUDIT_STARTS = 16
@@ -319,6 +329,54 @@ def fronts(page: Page, given: argparse.Namespace, parts: Path, size: str) -> Non
     for sentence in pareto.costs(found):
         page.note(sentence)
     page.note("Every point and its parameters are in `pareto.json`; `cpjax pareto` traces them with more effort.")
+
+
+def bench(page: Page, given: argparse.Namespace, size: str) -> None:
+    """Adds the section on the paper's and the tuned controllers on a bench, and writes bench.toml.
+
+    Args:
+      size: quick (coarse grids, two controllers) or full.
+    """
+    rig = a_bench(paper.appendix_plant())
+    io.save(given.out / "bench.toml", rig)
+    quick = size == "quick"
+    names = QUICK_CARDS if quick else robustness.DEFAULT
+    settings = RobustnessConfig(seed=given.seed, **(QUICK_CARD if quick else {}))
+    firmware = build_firmware({}, rig, {"dt": settings.dt, "control_period": settings.control_period}, given.seed)
+    controllers = {name: named_hybrid(name, rig.plant) for name in names}
+    cards, picture = robustness.run_robustness(given.out, rig, controllers, settings, firmware.notes, firmware)
+    page.section("On a bench")
+    page.text(
+        "So far the plant was measured exactly and obeyed at once. Here it has encoders of 4,096 counts a turn, a "
+        "Kalman filter in place of measured rates, a delay of one control period, a lag of 2 ms, a dead band of 0.2 V, "
+        "which the firmware makes up for, and dry friction of 0.3 N. The rig is then varied, one thing at a time, and "
+        "all parameters of the plant at once."
+    )
+    if quick:
+        page.text(
+            f"A coarse version: {settings.values} values in each grid, {settings.starts} initial states each. "
+            "`cpjax robustness`, or `make report-full`, does it in full."
+        )
+    page.picture(
+        picture,
+        "Success rate against what is wrong, with 95 % intervals; upper left: thick lines are means over the plant's "
+        "parameters, thin lines one parameter each.",
+    )
+    _, header, rows = robustness.table(cards)
+    page.table(header, rows, text_columns=1)
+    page.note(
+        "Means over each grid, plus or minus half of the 95 % interval. Every number is in `robustness.json`, the rig "
+        "in `bench.toml`: `cpjax robustness --rig bench.toml`."
+    )
+
+
+def a_bench(plant: CartPole) -> Rig:
+    """Returns the paper's plant on a bench: numbers of a usual rig, for the paper states none."""
+    return Rig(
+        dataclasses.replace(plant, coulomb_friction=0.3),
+        sensors=Encoders(x_step=1e-4, theta_step=math.tau / 4096),
+        drive=Drive(delay=0.002, dead_band=0.2, lag=0.002),
+    )
 
 
 def how_to_reproduce(page: Page, setting: EvaluationConfig, cells: int, studies: str) -> None:

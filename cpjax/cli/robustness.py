@@ -17,10 +17,14 @@ from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
+from cpjax.presets import PRESETS
 from cpjax.rig import Rig, plant_of
 from cpjax.study.robustness import RobustnessCard, RobustnessConfig, duration_of, robustness_card, target_bands
 
-CONTROLLERS = ("corrected-centred/lqr", "corrected-centred/placement", "tuned_lqr", "tuned_place")
+_LAWS = ("corrected-centred/lqr", "corrected-centred/placement")
+_TUNED = (PRESETS["lqr"], PRESETS["placement"])
+DEFAULT = (*_LAWS, *_TUNED)
+"""Controllers that are compared on a rig without a tuned controller of its own."""
 _PICTURE, _JSON = "robustness.png", "robustness.json"
 
 OPTIONS = [
@@ -28,7 +32,8 @@ OPTIONS = [
         "card",
         "controllers",
         "one card each: tuned_lqr, tuned_place, a file, or a law of the paper with its regulator, such as "
-        "corrected/lqr/computed (default " + " ".join(CONTROLLERS) + ")",
+        f"corrected/lqr/computed (default {' '.join(_LAWS)} and {' '.join(_TUNED)}, or on a public rig with a tuned "
+        "controller of its own that one)",
         count="+",
     ),
     *(
@@ -60,7 +65,8 @@ def run(given: argparse.Namespace) -> int:
     rig = build_rig(sections["plant"])
     plant = plant_of(rig)
     chosen = dict(sections["card"])
-    names = chosen.pop("controllers", list(CONTROLLERS))
+    own = PRESETS.get(sections["plant"].get("rig", ""))
+    names = chosen.pop("controllers", list(DEFAULT) if own is None else [*_LAWS, own])
     if len(set(names)) < len(names):
         raise InputError("controllers", names, "each one once")
     controllers = {name: named_hybrid(name, plant) for name in names}

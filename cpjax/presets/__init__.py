@@ -1,4 +1,4 @@
-"""Tuned controllers that come with the package, for the plant of the paper's appendix at 12 V; see docs/results.md."""
+"""Tuned controllers that come with the package: for the plant of the paper's appendix, and for public rigs."""
 
 import importlib.resources
 from collections.abc import Mapping
@@ -8,26 +8,31 @@ import jax
 import numpy as np
 
 from cpjax import io
-from cpjax.controllers import DesignName, Hybrid
+from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.pytree import numbers
 
-PRESETS: Mapping[DesignName, str] = {"lqr": "tuned_lqr", "placement": "tuned_place"}
-"""File name, without extension, of each design's preset in this folder; written by `cpjax.save`."""
+PRESETS: Mapping[str, str] = {
+    "lqr": "tuned_lqr",
+    "placement": "tuned_place",
+    "quanser-ip02-long": "tuned_quanser_ip02_long",
+}
+"""File name, without extension, of each preset in this folder; written by `cpjax tune`. See docs/results.md."""
 
 
-def preset(design: DesignName) -> Hybrid:
-    """Loads the tuned hybrid controller whose regulator comes from "lqr" or "placement".
+def preset(design: str) -> Hybrid:
+    """Loads a tuned hybrid controller.
 
-    Both were tuned for `cpjax.paper.appendix_plant()`, with its supply of 12 V. On another plant they may fail:
-    `model_differences(controller, plant)` lists the differences.
+    "lqr" and "placement", by the design of their regulators, were tuned for `cpjax.paper.appendix_plant()`, with its
+    supply of 12 V; "quanser-ip02-long" for the public rig of that name, within its track. On another plant they may
+    fail: `model_differences(controller, plant)` lists the differences.
 
     Args:
-      design: design of the regulator's gain, "lqr" or "placement".
+      design: "lqr", "placement" or "quanser-ip02-long".
 
     Raises:
-      InputError: another design.
+      InputError: another name.
     """
     if design not in PRESETS:
         raise InputError("design", design, "one of " + ", ".join(PRESETS))

@@ -8,7 +8,7 @@ Beside them: all parameters of the plant wrong at once.
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -27,7 +27,7 @@ from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.sweep import sweep
 
 Progress = Callable[[str, int, int], None]
-"""Function called with the name of a criterion, the number of runs done and their total."""
+"""Function called with what runs, the number of runs done and their total."""
 
 _KNOWN = ("gravity", "static_friction_ratio")
 """Parameters that are not varied: a constant, and a ratio that is 1 at least."""
@@ -107,14 +107,20 @@ class RobustnessCard(NamedTuple):
     """Success with all parameters of the plant wrong at once."""
 
 
-class _Variation(NamedTuple):
-    """Grid to be run: a rig of arrays (values * starts,)."""
+class _Part(NamedTuple):
+    """Grid to be run, and what differs from the rig as it is: arrays (values * trials,) by name."""
 
     criterion: str
     name: str
     unit: str
     values: Float[np.ndarray, " values"]
-    rig: Rig
+    trials: int
+    changes: Mapping[str, Float[np.ndarray, " runs"]]
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return self.trials * len(self.values)
 
 
 TITLES: Mapping[str, str] = {
@@ -145,7 +151,7 @@ def robustness_card(
       rig: the rig, with sensors, drive and track of its own; a bare plant is an ideal rig.
       controller: the firmware as it runs on this rig (with encoders, one that estimates rates).
       settings: the grids; by default those of the protocol.
-      progress: called after each grid.
+      progress: called after each part of the runs.
 
     Raises:
       InputError: a rig or controller that no sweep can run, or whose parameters are arrays.
@@ -154,41 +160,40 @@ def robustness_card(
     rig = rig if isinstance(rig, Rig) else Rig(rig)
     if any(np.ndim(leaf) for leaf in jax.tree.leaves(rig.plant)):
         raise InputError("rig.plant", "of arrays", "one plant, of scalar parameters")
-    n = settings.starts
-    starts = initial_states(rig, n, settings.seed)
-    variations = list(_variations(rig, settings))
-    total = n + settings.rigs + sum(n * len(v.values) for v in variations)
-    done = 0
+    # All grids of the plant are one sweep, and all others are another: two compilations in all.
+    plants, benches = _plant_parts(rig, settings), _bench_parts(rig, settings)
+    total = sum(part.runs for part in (*plants, *benches))
 
-    def run(variation: _Variation, starts: State, trials: int) -> Grid:
-        nonlocal done
+    def run(parts: Sequence[_Part], whole: Rig, before: int, name: str) -> list[Grid]:
+        states = [_tiled(initial_states(rig, part.trials, settings.seed), len(part.values)) for part in parts]
         metrics: Metrics = sweep(
-            variation.rig,
+            whole,
             controller,
-            starts,
+            jax.tree.map(lambda *columns: np.concatenate(columns), *states),
             metrics=protocol_of(rig),
             duration=duration_of(rig, settings.dt),
             dt=settings.dt,
             control_period=settings.control_period,
             clock="sampled",
             seed=settings.seed,
+            progress=None if progress is None else lambda done, _: progress(name, before + done, total),
         )
-        successes = np.asarray(metrics.success).reshape(len(variation.values), trials).sum(axis=1)
-        done += trials * len(variation.values)
-        if progress is not None:
-            progress(variation.name, done, total)
-        return Grid(variation.name, variation.unit, variation.values, successes, trials)
+        ends = np.cumsum([part.runs for part in parts])
+        pieces = np.split(np.asarray(metrics.success), ends[:-1])
+        return [
+            Grid(part.name, part.unit, part.values, piece.reshape(-1, part.trials).sum(axis=1), part.trials)
+            for part, piece in zip(parts, pieces, strict=True)
+        ]
 
-    one = np.array([0.0])
-    nominal = run(_Variation("", "as it is", "", one, rig), starts, n)
-    grids = [(v.criterion, run(v, _tiled(starts, len(v.values)), n)) for v in variations]
-    wrong = _all_wrong(rig.plant, settings)
-    together = _Variation("", "all parameters", "", one, dataclasses.replace(rig, plant=wrong))
+    nominal, *of_plant, together = run(plants, _with_plants(rig, plants), 0, "parameters of the plant")
+    done = sum(part.runs for part in plants)
+    of_bench = run(benches, _with_benches(rig, benches, settings), done, "noise, lag, delay and pushes")
+    found = [*zip(plants[1:-1], of_plant, strict=True), *zip(benches, of_bench, strict=True)]
     criteria = tuple(
-        Criterion(name, title, tuple(grid for of, grid in grids if of == name)) for name, title in TITLES.items()
+        Criterion(name, title, tuple(grid for part, grid in found if part.criterion == name))
+        for name, title in TITLES.items()
     )
-    all_at_once = run(together, initial_states(rig, settings.rigs, settings.seed), settings.rigs)
-    return RobustnessCard(nominal, criteria, all_at_once)
+    return RobustnessCard(nominal, criteria, together)
 
 
 def initial_states(rig: Rig, number_of_states: int, seed: int) -> State:
@@ -228,66 +233,88 @@ def protocol_of(rig: Rig) -> ProtocolMetrics:
     return ProtocolMetrics(angle_band=angle, position_band=position, track_limit=ends)
 
 
-def _variations(rig: Rig, settings: RobustnessConfig) -> Iterator[_Variation]:
+def _plant_parts(rig: Rig, settings: RobustnessConfig) -> list[_Part]:
+    """Returns the rig as it is, one grid for each parameter of the plant, and all parameters at once."""
+    n, plant, varied = settings.starts, rig.plant, _varied(rig.plant)
+    factors = 1.0 + settings.spread * np.linspace(-1.0, 1.0, settings.values)
+    one = np.array([0.0])
+    parts = [_Part("", "as it is", "", one, n, {})]
+    for name, rule in varied.items():
+        values = float(parameter(plant, name)) * factors
+        parts.append(_Part("plant", name, rule.unit, values, n, {name: _within(np.repeat(values, n), rule)}))
+    random = np.random.default_rng([settings.seed, 7])
+    spread = settings.spread_of_all
+    shares = random.uniform(1.0 - spread, 1.0 + spread, (len(varied), settings.rigs))
+    wrong = {
+        name: _within(float(parameter(plant, name)) * row, rule)
+        for (name, rule), row in zip(varied.items(), shares, strict=True)
+    }
+    return [*parts, _Part("", "all parameters", "", one, settings.rigs, wrong)]
+
+
+def _bench_parts(rig: Rig, settings: RobustnessConfig) -> list[_Part]:
+    """Returns the grids of what is beside the plant."""
     n, plant = settings.starts, rig.plant
     shares = np.linspace(0.0, 1.0, settings.values)
-    drive = Drive() if rig.drive is None else rig.drive
-
-    def each(values: Float[np.ndarray, " values"]) -> Float[np.ndarray, " runs"]:
-        return np.repeat(values, n)
-
-    varied = _varied(plant)
-    # All are arrays in each grid, and in that of all at once, so that one compilation serves them all.
-    same = {name: np.full(n * settings.values, float(parameter(plant, name))) for name in varied}
-    for name, rule in varied.items():
-        factors = 1.0 + settings.spread * (2.0 * shares - 1.0)
-        values = float(parameter(plant, name)) * factors
-        changed = with_parameters(plant, {**same, name: _within(each(values), rule)})
-        yield _Variation("plant", name, rule.unit, values, dataclasses.replace(rig, plant=changed))
-    yield _noisy(rig, settings, shares, each)
+    encoders = isinstance(rig.sensors, Encoders)
+    noise = shares * (settings.noise_steps if encoders else settings.rate_noise)
     supply = float(plant.motor.voltage_limit)
-    scale = supply if math.isfinite(supply) else 12.0
-    values = settings.voltage_noise * shares * scale
-    noisy = dataclasses.replace(drive, noise=each(values))
-    yield _Variation("voltage", "noise", "V", values, dataclasses.replace(rig, drive=noisy))
-    values = settings.lag * shares
-    # A lag of 0 is one that is far below the step.
-    lagging = dataclasses.replace(drive, lag=each(np.maximum(values, 1e-6 * settings.dt)))
-    yield _Variation("lag", "time constant", "s", values, dataclasses.replace(rig, drive=lagging))
-    values = settings.control_period * np.rint(settings.delay * shares / settings.control_period)
-    values = values + float(drive.delay)
-    late = dataclasses.replace(drive, delay=each(values))
-    yield _Variation("delay", "delay", "s", values, dataclasses.replace(rig, drive=late))
+    late = settings.control_period * np.rint(settings.delay * shares / settings.control_period)
+    base = 0.0 if rig.drive is None else float(rig.drive.delay)
     weight = float(plant.pole_mass) * float(plant.gravity)
-    values = settings.push * shares * weight
-    last = 0.75 * duration_of(rig, settings.dt)
-    pushes = RandomPushes(every=last / 3.0, cart=each(values), pole=each(values), until=last)
-    disturbance = Disturbance() if rig.disturbance is None else rig.disturbance
-    pushed = dataclasses.replace(disturbance, pushes=pushes)
-    yield _Variation("pushes", "force", "N", values, dataclasses.replace(rig, disturbance=pushed))
+    grids = [
+        ("measurement", "noise", "steps" if encoders else "rad/s", noise),
+        ("voltage", "noise", "V", settings.voltage_noise * shares * (supply if math.isfinite(supply) else 12.0)),
+        ("lag", "time constant", "s", settings.lag * shares),
+        ("delay", "delay", "s", base + late),
+        ("pushes", "force", "N", settings.push * shares * weight),
+    ]
+    return [_Part(key, name, unit, values, n, {key: np.repeat(values, n)}) for key, name, unit, values in grids]
 
 
-def _noisy(rig: Rig, settings: RobustnessConfig, shares: Any, each: Any) -> _Variation:
-    """Returns the grid of the sensors' noise: in steps of the encoders or, with rates measured, of the rates' noise."""
-    sensors = rig.sensors
+def _columns(parts: Sequence[_Part], defaults: Mapping[str, float]) -> dict[str, Float[np.ndarray, " runs"]]:
+    """Returns arrays over all runs of the parts: what a part changes, and else the defaults."""
+    return {
+        name: np.concatenate([part.changes.get(name, np.full(part.runs, value)) for part in parts])
+        for name, value in defaults.items()
+    }
+
+
+def _with_plants(rig: Rig, parts: Sequence[_Part]) -> Rig:
+    """Returns the rig with the plant of each run."""
+    nominal = {name: float(parameter(rig.plant, name)) for name in _varied(rig.plant)}
+    return dataclasses.replace(rig, plant=with_parameters(rig.plant, _columns(parts, nominal)))
+
+
+def _with_benches(rig: Rig, parts: Sequence[_Part], settings: RobustnessConfig) -> Rig:
+    """Returns the rig with the noise, the drive and the pushes of each run.
+
+    A lag of 0 is one far below the step, which has the same effect.
+    """
+    drive = Drive() if rig.drive is None else rig.drive
+    sensors = StateSensors() if rig.sensors is None else rig.sensors
+    least = 1e-6 * settings.dt
+    own = {"measurement": 0.0, "voltage": float(drive.noise), "delay": float(drive.delay), "pushes": 0.0}
+    found = _columns(parts, {**own, "lag": least if drive.lag is None else float(drive.lag)})
+    noise = found["measurement"]
+    changes: dict[str, Any] = {}
     if isinstance(sensors, Encoders):
-        values = settings.noise_steps * shares
-        x, theta = (float(step) for step in (sensors.x_step, sensors.theta_step))
-        more = {"x_noise": each(values) * x, "theta_noise": each(values) * theta}
-        return _Variation(
-            "measurement",
-            "noise",
-            "steps",
-            values,
-            dataclasses.replace(rig, sensors=dataclasses.replace(sensors, **more)),
-        )
-    values = settings.rate_noise * shares
-    base = StateSensors() if sensors is None else sensors
-    # The cart's rate is noisy by as much at the height of the pole's centre of mass.
-    more = {"theta_dot_noise": each(values), "x_dot_noise": each(values) * float(rig.plant.pole_length)}
-    return _Variation(
-        "measurement", "noise", "rad/s", values, dataclasses.replace(rig, sensors=dataclasses.replace(base, **more))
-    )
+        for name in ("x", "theta"):
+            step, usual = float(getattr(sensors, f"{name}_step")), float(getattr(sensors, f"{name}_noise"))
+            changes[f"{name}_noise"] = np.hypot(noise * step, usual)
+    else:
+        # The cart's rate is noisy by as much at the distance of the pole's centre of mass.
+        length = float(rig.plant.pole_length)
+        changes["theta_dot_noise"] = np.hypot(noise, float(sensors.theta_dot_noise))
+        changes["x_dot_noise"] = np.hypot(noise * length, float(sensors.x_dot_noise))
+    sensors = dataclasses.replace(sensors, **changes)
+    last = 0.75 * duration_of(rig, settings.dt)
+    force = found["pushes"]
+    pushes = RandomPushes(every=last / 3.0, cart=force, pole=force, until=last)
+    disturbance = dataclasses.replace(Disturbance() if rig.disturbance is None else rig.disturbance, pushes=pushes)
+    lag = np.maximum(found["lag"], least)
+    drive = dataclasses.replace(drive, noise=found["voltage"], lag=lag, delay=found["delay"])
+    return dataclasses.replace(rig, sensors=sensors, drive=drive, disturbance=disturbance)
 
 
 def _varied(plant: CartPole) -> dict[str, Number]:
@@ -302,18 +329,6 @@ def _varied(plant: CartPole) -> dict[str, Number]:
 
 def _within(values: Float[np.ndarray, " n"], rule: Number) -> Float[np.ndarray, " n"]:
     return np.clip(values, rule.at_least, rule.at_most)
-
-
-def _all_wrong(plant: CartPole, settings: RobustnessConfig) -> CartPole:
-    """Returns plants (rigs,) whose parameters are all wrong, each uniformly within `spread_of_all`."""
-    random = np.random.default_rng([settings.seed, 7])
-    varied = _varied(plant)
-    factors = random.uniform(1.0 - settings.spread_of_all, 1.0 + settings.spread_of_all, (len(varied), settings.rigs))
-    values = {
-        name: _within(float(parameter(plant, name)) * row, rule)
-        for (name, rule), row in zip(varied.items(), factors, strict=True)
-    }
-    return with_parameters(plant, values)
 
 
 def _tiled(starts: State, times: int) -> State:
