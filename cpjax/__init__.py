@@ -59,7 +59,19 @@ from cpjax.plant import (
     sample_starts,
 )
 from cpjax.presets import preset
-from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, StateSensors, Track, Wind, rig
+from cpjax.rig import (
+    Disturbance,
+    Drive,
+    Encoders,
+    Potentiometers,
+    Pushes,
+    RandomPushes,
+    Rig,
+    StateSensors,
+    Track,
+    Wind,
+    rig,
+)
 from cpjax.sim.flags import Flag
 from cpjax.sim.gradients import Gradients, gradients
 from cpjax.sim.metrics import Metrics, ProtocolMetrics, TimeOutside
@@ -107,6 +119,7 @@ __all__ = [
     "Observer",
     "PerformanceWarning",
     "PoleFactors",
+    "Potentiometers",
     "ProtocolMetrics",
     "Pushes",
     "QuadraticFactors",

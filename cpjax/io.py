@@ -41,7 +41,19 @@ from cpjax.files import dump_json, read_table, suffix_of, write_text
 from cpjax.plant import AccelerationActuator, CartPole, ForceActuator, LumpedMotor, Motor
 from cpjax.plant.state import State
 from cpjax.pytree import is_traced
-from cpjax.rig import Disturbance, Drive, Encoders, Pushes, RandomPushes, Rig, StateSensors, Track, Wind, plant_of
+from cpjax.rig import (
+    Disturbance,
+    Drive,
+    Encoders,
+    Potentiometers,
+    Pushes,
+    RandomPushes,
+    Rig,
+    StateSensors,
+    Track,
+    Wind,
+    plant_of,
+)
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import Trajectory
 
@@ -75,6 +87,7 @@ TYPES: dict[str, type] = {
         ForceActuator,
         AccelerationActuator,
         Encoders,
+        Potentiometers,
         StateSensors,
         Drive,
         Track,

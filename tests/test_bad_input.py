@@ -521,7 +521,7 @@ def test_a_bad_argument_of_a_sweep_is_refused(starts, settings, field, value, al
 @rows(
     ("arguments", "field", "value", "allowed"),
     [
-        *(((v, 1, 1), "starts", repr(v), "one of hanging, anywhere, rest") for v in ("Hanging", "", None, 1, [])),
+        *(((v, 1, 1), "starts", repr(v), "one of hanging, anywhere, wide, rest") for v in ("Hanging", "", None, 1, [])),
         *((("rest", v, 1), "count", repr(v), "a whole number, at least 1") for v in (0, -1, 1.0, True, "1", None)),
         *((("rest", 1, v), "seed", repr(v), "a whole number, at least 0") for v in (-1, 1.0, True, "1", None)),
     ],

@@ -112,6 +112,7 @@ THINGS |= {
     "Wind": RIG.disturbance.wind,
     "RandomPushes": cpjax.RandomPushes(cart=1.0 / 3.0),
     "StateSensors": cpjax.StateSensors(theta_dot_noise=0.1),
+    "Potentiometers": cpjax.Potentiometers(dead_angle=0.3),
     "IntegralAction": cpjax.IntegralAction(LAW, -10.0 / 3.0),
     "MovingReference": cpjax.MovingReference.steps(LAW, [0.0, 1.0], [0.1, -0.1]),
     "VoltageSignal": cpjax.VoltageSignal([0.0, 0.1], [1.0, -1.0]),

@@ -20,6 +20,7 @@ from cpjax.cli.rigs import (
     BARE,
     FIRMWARE_OPTIONS,
     RIG_OPTIONS,
+    TRACK_OPTION,
     Firmware,
     build_firmware,
     build_rig,
@@ -71,6 +72,7 @@ OPTIONS = [
     Option("run", "dt", "integration step and control period [s] (default 0.002)", float),
     *PLANT_OPTIONS,
     *RIG_OPTIONS,
+    TRACK_OPTION,
     *FIRMWARE_OPTIONS,
 ]
 

@@ -14,12 +14,13 @@ from cpjax.controllers.estimators import kalman_observer
 from cpjax.errors import InputError
 from cpjax.plant import CartPole, with_parameters
 from cpjax.pytree import Number
-from cpjax.rig import PRESETS, Encoders, Rig, plant_of
+from cpjax.rig import PRESETS, Encoders, Potentiometers, Rig, StateSensors, Track, plant_of
 from cpjax.rig import rig as named_rig
 
 PARTS = tuple(field.name for field in dataclasses.fields(Rig) if field.name != "plant")
 """Names of what a rig may have beside its plant."""
 
+_FINEST = 1e-6  # step [m, rad] of sensors without one, so that no deviation is 0
 _CUTOFF = 300.0  # default of --cutoff [rad/s]
 
 RIG_OPTIONS = [
@@ -31,6 +32,13 @@ RIG_OPTIONS = [
     ),
     Option("plant", "without", "parts of the rig to leave out, with commas between: " + ", ".join(PARTS)),
 ]
+
+TRACK_OPTION = Option(
+    "plant",
+    "track_limit",
+    "leaving |x| within it is failure, also on a plant alone (default the rig's track, or none) [m]",
+    float,
+)
 
 ESTIMATOR_OPTIONS = [
     Option(
@@ -83,11 +91,13 @@ def build_rig(given: Mapping[str, Any]) -> Rig | CartPole:
       InputError: a rig together with a base, an unknown part to leave out, or as for `load_rig` and `build_plant`.
     """
     changes = dict(given)
-    name, without = changes.pop("rig", None), changes.pop("without", None)
+    name, without, limit = (changes.pop(key, None) for key in ("rig", "without", "track_limit"))
+    track = None if limit is None else Track(half_length=limit)
     if name is None:
         if without is not None:
             raise InputError("without", without, "absent where no rig is given")
-        return build_plant(changes)
+        plant = build_plant(changes)
+        return plant if track is None else Rig(plant, track=track)
     if "base" in changes:
         raise InputError("plant", changes["base"], "absent where a rig is given")
     left_out = [part.strip() for part in (without or "").split(",") if part.strip()]
@@ -96,6 +106,7 @@ def build_rig(given: Mapping[str, Any]) -> Rig | CartPole:
             raise InputError("without", part, "one of " + ", ".join(PARTS))
     rig = load_rig(name)
     changed: dict[str, Any] = {"plant": with_parameters(rig.plant, changes), **dict.fromkeys(left_out)}
+    changed |= {} if track is None else {"track": track}
     return dataclasses.replace(rig, **changed)
 
 
@@ -200,7 +211,8 @@ def build_firmware(
     sensors, drive = parts_of(rig).get("sensors"), parts_of(rig).get("drive")
     slow = "control_period" if "control_period" in setting else "dt"
     period = Number("s", "control period", above=0.0).normalise(slow, setting[slow])
-    kind = given.get("estimator", "none" if sensors is None else "kalman")
+    rates = sensors is None or isinstance(sensors, StateSensors)
+    kind = given.get("estimator", "none" if rates else "kalman")
     simulation: dict[str, Any] = {"control_period": period} if "control_period" in setting else {}
     if isinstance(rig, Rig):
         simulation["seed"] = seed
@@ -222,13 +234,13 @@ def build_firmware(
         band = f"commands within the drive's dead band of {dead_band:g} V have no effect, and nothing raises them"
         return Firmware(simulation=simulation, notes=(band,) if dead_band else ())
     if kind == "kalman":
-        if not isinstance(sensors, Encoders):
-            raise InputError("estimator", kind, "derivative or none, on a plant without sensors")
+        if not isinstance(sensors, (Encoders, Potentiometers)):
+            raise InputError("estimator", kind, "derivative or none, on a plant whose rates are measured")
         estimator: Any = kalman_observer(
             plant_of(rig),
             period=period,
-            x_deviation=_deviation(sensors.x_step, sensors.x_noise),
-            theta_deviation=_deviation(sensors.theta_step, sensors.theta_noise),
+            x_deviation=_deviation(getattr(sensors, "x_step", _FINEST), sensors.x_noise),
+            theta_deviation=_deviation(getattr(sensors, "theta_step", _FINEST), sensors.theta_noise),
         )
         words = f"a Kalman filter designed for the plant and a control period of {period:g} s"
     else:

@@ -12,7 +12,16 @@ from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, options_of, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
-from cpjax.cli.rigs import BARE, FIRMWARE_OPTIONS, RIG_OPTIONS, Firmware, build_firmware, build_rig, with_usual_period
+from cpjax.cli.rigs import (
+    BARE,
+    FIRMWARE_OPTIONS,
+    RIG_OPTIONS,
+    TRACK_OPTION,
+    Firmware,
+    build_firmware,
+    build_rig,
+    with_usual_period,
+)
 from cpjax.cli.tables import print_table
 from cpjax.controllers import Hybrid
 from cpjax.errors import InputError
@@ -43,6 +52,7 @@ OPTIONS = [
     ),
     *PLANT_OPTIONS,
     *RIG_OPTIONS,
+    TRACK_OPTION,
     *FIRMWARE_OPTIONS,
 ]
 

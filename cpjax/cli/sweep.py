@@ -13,7 +13,15 @@ from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, resolve
 from cpjax.cli.output import say
 from cpjax.cli.progress import progress
-from cpjax.cli.rigs import FIRMWARE_OPTIONS, RIG_OPTIONS, build_firmware, build_rig, split_period, with_usual_period
+from cpjax.cli.rigs import (
+    FIRMWARE_OPTIONS,
+    RIG_OPTIONS,
+    TRACK_OPTION,
+    build_firmware,
+    build_rig,
+    split_period,
+    with_usual_period,
+)
 from cpjax.cli.tables import print_table
 from cpjax.plant.initial_states import sample_starts
 from cpjax.rig import plant_of
@@ -30,6 +38,7 @@ OPTIONS = [
     Option("sweep", "save_every", "keep every so many steps of the trajectories, instead of metrics", int),
     *PLANT_OPTIONS,
     *RIG_OPTIONS,
+    TRACK_OPTION,
     *CONTROLLER_OPTIONS,
     *FIRMWARE_OPTIONS,
 ]

@@ -21,7 +21,7 @@ from cpjax.cli.builders import (
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import add_options, resolve
 from cpjax.cli.output import say
-from cpjax.cli.rigs import ESTIMATOR_OPTIONS, RIG_OPTIONS, build_firmware, build_rig, with_usual_period
+from cpjax.cli.rigs import ESTIMATOR_OPTIONS, RIG_OPTIONS, TRACK_OPTION, build_firmware, build_rig, with_usual_period
 from cpjax.controllers import REGULATE, Hybrid
 from cpjax.errors import InputError
 from cpjax.rig import plant_of
@@ -29,7 +29,15 @@ from cpjax.sim.flags import STOPPED, Flag, describe
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.rollout import Trajectory, default_metrics, rollout
 
-OPTIONS = [*START_OPTIONS, *RUN_OPTIONS, *PLANT_OPTIONS, *RIG_OPTIONS, *CONTROLLER_OPTIONS, *ESTIMATOR_OPTIONS]
+OPTIONS = [
+    *START_OPTIONS,
+    *RUN_OPTIONS,
+    *PLANT_OPTIONS,
+    *RIG_OPTIONS,
+    TRACK_OPTION,
+    *CONTROLLER_OPTIONS,
+    *ESTIMATOR_OPTIONS,
+]
 
 _ROWS = (
     ("settling time", "settling_time", "s"),

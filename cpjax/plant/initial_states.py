@@ -17,6 +17,7 @@ from cpjax.plant.state import HANGING, NAMES, State
 _SETS: Mapping[str, Mapping[str, tuple[float, float]]] = {
     "hanging": {"x": (0.0, 0.1), "x_dot": (0.0, 0.0), "theta": (math.pi, 0.3), "theta_dot": (0.0, 0.3)},
     "anywhere": {"x": (0.0, 0.3), "x_dot": (0.0, 0.5), "theta": (0.0, math.pi), "theta_dot": (0.0, 4.0)},
+    "wide": {"x": (0.0, 0.15), "x_dot": (0.0, 0.0), "theta": (math.pi, 0.4), "theta_dot": (0.0, 0.4)},
     "rest": {name: (getattr(HANGING, name), 0.0) for name in NAMES},
 }
 
@@ -30,6 +31,7 @@ def sample_starts(name: str, count: int, *, seed: int, dtype: Any = np.float64) 
     """Draws initial states from a named set.
 
     hanging: |x| <= 0.1 m, x_dot = 0, theta = pi +- 0.3 rad, |theta_dot| <= 0.3 rad/s.
+    wide: |x| <= 0.15 m, x_dot = 0, theta = pi +- 0.4 rad, |theta_dot| <= 0.4 rad/s: just outside what tuning sees.
     anywhere: |x| <= 0.3 m, |x_dot| <= 0.5 m/s, theta anywhere on the circle, |theta_dot| <= 4 rad/s.
     rest: exactly hanging at rest, `count` times.
 

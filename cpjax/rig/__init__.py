@@ -4,7 +4,7 @@ from cpjax.rig.bench import Rig, plant_of
 from cpjax.rig.disturbance import Disturbance, Pushes, RandomPushes, Wind
 from cpjax.rig.drive import Drive
 from cpjax.rig.presets import PRESETS, rig
-from cpjax.rig.sensors import Encoders, Position, StateSensors
+from cpjax.rig.sensors import Encoders, Position, Potentiometers, StateSensors
 from cpjax.rig.track import Track
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "Drive",
     "Encoders",
     "Position",
+    "Potentiometers",
     "Pushes",
     "RandomPushes",
     "Rig",

@@ -12,7 +12,7 @@ from cpjax.pytree import is_traced, part, pytree
 from cpjax.rig.disturbance import Disturbance
 from cpjax.rig.drive import Drive
 from cpjax.rig.dynamics import ChangingBench, OnTheBench
-from cpjax.rig.sensors import Encoders, Sensors, StateSensors
+from cpjax.rig.sensors import Encoders, Potentiometers, Sensors, StateSensors
 from cpjax.rig.track import Track
 
 
@@ -32,7 +32,7 @@ class Rig:
 
     def __post_init__(self) -> None:
         kinds = {
-            "sensors": (Encoders, StateSensors),
+            "sensors": (Encoders, Potentiometers, StateSensors),
             "drive": (Drive,),
             "track": (Track,),
             "disturbance": (Disturbance,),

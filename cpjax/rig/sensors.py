@@ -1,11 +1,13 @@
 """Sensors: what the firmware measures of the plant's state."""
 
+import math
 from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cpjax.numeric.angles import wrap_angle
 from cpjax.numeric.noise import Word, standard_normals
 from cpjax.numeric.quantisation import quantize
 from cpjax.plant.state import State
@@ -56,6 +58,38 @@ class StateSensors:
 
 
 @pytree
+class Potentiometers:
+    """Potentiometers of cart and pole: positions with white noise, and an angle at which the pole's reads nothing.
+
+    Within `dead_angle` about `dead_centre` its wiper is off the track, and the reading stays at the nearer end.
+    """
+
+    x_noise: Scalar = number("m", "standard deviation of the noise on x", default=0.0, at_least=0.0)
+    theta_noise: Scalar = number("rad", "standard deviation of the noise on theta", default=0.0, at_least=0.0)
+    theta_offset: Scalar = number("rad", "error of the angle's zero", default=0.0)
+    dead_angle: Scalar = number("rad", "width of the gap in the track", default=0.0, at_least=0.0, below=math.pi)
+    dead_centre: Scalar = number("rad", "angle of the gap's middle", default=0.5 * math.pi)
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the noise is not known to be zero."""
+        return _any_noise(self.x_noise, self.theta_noise)
+
+    def measure(
+        self, state: State, key: tuple[Word, Word], counter: tuple[Word, Word], *, noisy: bool = True
+    ) -> Position:
+        """Returns the measurement of a state; arguments as of `Encoders.measure`."""
+        from_gap = wrap_angle(state.theta - self.dead_centre)
+        end = jnp.where(from_gap < 0.0, -0.5, 0.5) * self.dead_angle
+        in_gap = jnp.abs(from_gap) < 0.5 * self.dead_angle
+        x, theta = state.x, state.theta + jnp.where(in_gap, end - from_gap, 0.0) + self.theta_offset
+        if noisy:
+            of_x, of_theta = standard_normals(key, counter, jnp.asarray(state.x).dtype)
+            x, theta = x + self.x_noise * of_x, theta + self.theta_noise * of_theta
+        return Position(jnp.asarray(x), jnp.asarray(theta))
+
+
+@pytree
 class Encoders:
     """Incremental encoders of cart and pole: step * round((value + noise) / step), of x and theta only.
 
@@ -96,7 +130,7 @@ class Encoders:
         )
 
 
-Sensors: TypeAlias = Encoders | StateSensors
+Sensors: TypeAlias = Encoders | Potentiometers | StateSensors
 """Classes of sensors that a rig may have."""
 
 

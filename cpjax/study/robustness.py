@@ -22,12 +22,15 @@ from cpjax.numeric.statistics import wilson_interval
 from cpjax.plant import CartPole, parameter, parameters_of, sample_starts, with_parameters
 from cpjax.plant.state import State
 from cpjax.pytree import Number
-from cpjax.rig import Disturbance, Drive, Encoders, RandomPushes, Rig, StateSensors
+from cpjax.rig import Disturbance, Drive, RandomPushes, Rig, StateSensors
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 from cpjax.sim.sweep import sweep
 
 Progress = Callable[[str, int, int], None]
 """Function called with what runs, the number of runs done and their total."""
+
+_USUAL_STEPS = {"x": 1e-4, "theta": math.tau / 4096}
+"""Steps of encoders [m, rad], in which the noise of sensors without steps is given."""
 
 _KNOWN = ("gravity", "static_friction_ratio")
 """Parameters that are not varied: a constant, and a ratio that is 1 at least."""
@@ -256,14 +259,14 @@ def _bench_parts(rig: Rig, settings: RobustnessConfig) -> list[_Part]:
     """Returns the grids of what is beside the plant."""
     n, plant = settings.starts, rig.plant
     shares = np.linspace(0.0, 1.0, settings.values)
-    encoders = isinstance(rig.sensors, Encoders)
-    noise = shares * (settings.noise_steps if encoders else settings.rate_noise)
+    rates = rig.sensors is None or isinstance(rig.sensors, StateSensors)
+    noise = shares * (settings.rate_noise if rates else settings.noise_steps)
     supply = float(plant.motor.voltage_limit)
     late = settings.control_period * np.rint(settings.delay * shares / settings.control_period)
     base = 0.0 if rig.drive is None else float(rig.drive.delay)
     weight = float(plant.pole_mass) * float(plant.gravity)
     grids = [
-        ("measurement", "noise", "steps" if encoders else "rad/s", noise),
+        ("measurement", "noise", "rad/s" if rates else "steps", noise),
         ("voltage", "noise", "V", settings.voltage_noise * shares * (supply if math.isfinite(supply) else 12.0)),
         ("lag", "time constant", "s", settings.lag * shares),
         ("delay", "delay", "s", base + late),
@@ -298,10 +301,10 @@ def _with_benches(rig: Rig, parts: Sequence[_Part], settings: RobustnessConfig) 
     found = _columns(parts, {**own, "lag": least if drive.lag is None else float(drive.lag)})
     noise = found["measurement"]
     changes: dict[str, Any] = {}
-    if isinstance(sensors, Encoders):
-        for name in ("x", "theta"):
-            step, usual = float(getattr(sensors, f"{name}_step")), float(getattr(sensors, f"{name}_noise"))
-            changes[f"{name}_noise"] = np.hypot(noise * step, usual)
+    if not isinstance(sensors, StateSensors):
+        for name, usual_step in _USUAL_STEPS.items():
+            step = float(getattr(sensors, f"{name}_step", usual_step))
+            changes[f"{name}_noise"] = np.hypot(noise * step, float(getattr(sensors, f"{name}_noise")))
     else:
         # The cart's rate is noisy by as much at the distance of the pole's centre of mass.
         length = float(rig.plant.pole_length)

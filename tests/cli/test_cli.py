@@ -245,7 +245,7 @@ def toml_of(case):
 
 
 OF_OTHER_DRIVES = {f"plant.{name}" for cls in (LumpedMotor, ForceActuator) for name in numbers(cls)}
-OF_RIGS = {"plant.rig", "plant.without", "firmware.estimator", "firmware.cutoff"}
+OF_RIGS = {"plant.rig", "plant.without", "plant.track_limit", "firmware.estimator", "firmware.cutoff"}
 """Tested in test_rig_command.py."""
 
 
@@ -477,7 +477,7 @@ BAD_FILES = [
     (f"[start]\ntheta = {LARGE}\n", ["theta"]),
     (f"[run]\ndt = {LARGE}\n", ["dt"]),
     ("[plant]\nbase = 1\n", ["[plant] base = 1", "a text"]),
-    ("[start]\nset = 'nowhere'\n", ["[start] set = 'nowhere'", "one of hanging, anywhere, rest"]),
+    ("[start]\nset = 'nowhere'\n", ["[start] set = 'nowhere'", "one of hanging, anywhere, wide, rest"]),
     ("[start]\ntheta = inf\n", ["theta = inf", "finite"]),
     ("[run]\nclock = 'Sampled'\n", ["[run] clock = 'Sampled'", "one of sampled, continuous"]),
     ("[run]\nclock = 1\n", ["[run] clock = 1", "a text"]),

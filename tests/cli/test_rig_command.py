@@ -411,3 +411,14 @@ def test_a_rig_goes_to_mujocos_format_and_comes_back_as_a_file_with_comments(com
     refused = command("rig", "import", tmp_path / "no.xml")
     assert refused.code == 2
     assert "root element = 'sdf'" in refused.err
+
+
+def test_a_track_limit_makes_a_run_that_leaves_it_fail(command, tmp_path, no_pictures):
+    for limit, code in ((5.0, 0), (0.05, 1)):
+        result = command(
+            "swingup", "--controller", "tuned_lqr", "--track-limit", limit, "--dt", 0.01, "--out", tmp_path
+        )
+        assert result.code == code
+    assert build_rig({"rig": "quanser-ip02-long", "track_limit": 0.3}).track.half_length == 0.3
+    refused = command("swingup", "--track-limit", -1.0, "--out", tmp_path)
+    assert "Track.half_length = -1.0" in refused.err

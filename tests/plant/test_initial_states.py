@@ -18,6 +18,12 @@ RANGES = {
         "theta": (math.pi - 0.3, math.pi + 0.3),
         "theta_dot": (-0.3, 0.3),
     },
+    "wide": {
+        "x": (-0.15, 0.15),
+        "x_dot": (0.0, 0.0),
+        "theta": (math.pi - 0.4, math.pi + 0.4),
+        "theta_dot": (-0.4, 0.4),
+    },
     "anywhere": {"x": (-0.3, 0.3), "x_dot": (-0.5, 0.5), "theta": (-math.pi, math.pi), "theta_dot": (-4.0, 4.0)},
     "rest": {"x": (0.0, 0.0), "x_dot": (0.0, 0.0), "theta": (math.pi, math.pi), "theta_dot": (0.0, 0.0)},
 }
@@ -28,7 +34,7 @@ def matrix(starts):
     return np.stack([getattr(starts, name) for name in NAMES], axis=-1)
 
 
-def test_the_sets_are_the_protocols_three():
+def test_the_sets_are_those_of_the_protocol():
     assert set(START_SETS) == set(RANGES)
 
 
@@ -71,7 +77,7 @@ def test_one_seed_always_gives_the_same_starts(name):
     np.testing.assert_array_equal(a, b)
 
 
-@rows("name", ["hanging", "anywhere"])
+@rows("name", ["hanging", "wide", "anywhere"])
 def test_two_seeds_give_different_starts_throughout(name):
     a, b = (matrix(sample_starts(name, 100, seed=seed)) for seed in (5, 6))
     assert not np.any((a == b)[:, np.ptp(a, axis=0) > 0])

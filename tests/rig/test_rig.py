@@ -210,3 +210,16 @@ def test_an_observer_halves_the_filtered_derivatives_velocity_error(period):
     cutoffs = np.geomspace(10.0, 3.0 / period, 25)
     best = np.min([errors(FilteredDerivative(cutoff=c).at_period(period)) for c in cutoffs], axis=0)
     assert np.all(errors(observer) <= 0.5 * best)
+
+
+def test_potentiometers_have_a_gap_and_sensors_of_the_state_the_stated_noise():
+    gap = cpjax.Potentiometers(dead_angle=0.4, dead_centre=math.pi)
+    key = (jnp.uint32(1), jnp.uint32(1))
+    for theta, seen in ((3.0, math.pi - 0.2), (-3.2, -math.pi - 0.2), (2.0, 2.0), (math.pi + 0.3, math.pi + 0.3)):
+        found = gap.measure(State(0.1, 0.0, theta, 0.0), key, (jnp.uint32(0), jnp.uint32(0)), noisy=False)
+        assert float(found.theta) == pytest.approx(seen)
+    noisy = cpjax.StateSensors(x_noise=0.1, x_dot_noise=0.2, theta_noise=0.3, theta_dot_noise=0.4)
+    counters = (jnp.arange(20_000, dtype=jnp.uint32), jnp.zeros(20_000, jnp.uint32))
+    found = jax.vmap(lambda *counter: noisy.measure(State(1.0, 2.0, 3.0, 4.0), key, counter).vector())(*counters)
+    np.testing.assert_allclose(np.mean(found, axis=0), [1.0, 2.0, 3.0, 4.0], atol=0.02)
+    np.testing.assert_allclose(np.cov(np.asarray(found).T), np.diag([0.01, 0.04, 0.09, 0.16]), atol=0.004)
