@@ -886,6 +886,9 @@ def test_the_studies_in_a_report_are_those_of_its_json(command, tmp_path, monkey
     monkeypatch.setattr(report_sections, "QUICK_FRONTS", fronts)
     tuning = {"candidates": 15, "restarts": 2, "batch": 2, "steps": 2, "final": 64}
     monkeypatch.setattr(report_sections, "QUICK_TUNING", tuning)
+    card = {"values": 2, "starts": 2, "rigs": 2}
+    monkeypatch.setattr(report_sections, "QUICK_CARD", card)
+    monkeypatch.setattr(report_sections, "QUICK_CARDS", ("tuned_place",))
     monkeypatch.setattr(report_sections, "QUICK_AUDIT", {"count": 2, "duration": 1.0, "dt": 0.005})
     assert command("report", "--out", tmp_path, *EVALUATION, "--cells", "8").code == 0
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
@@ -898,9 +901,12 @@ def test_the_studies_in_a_report_are_those_of_its_json(command, tmp_path, monkey
     assert expected in [cells[:3] for cells in page.rows]
     basins = document(tmp_path, "basin.json")["basins"]
     titles = [controller_title(name) for name in CONTROLLERS]
-    shown = [cells for cells in page.rows if cells and cells[0] in titles]
-    assert [cells[0] for cells in shown] == titles
-    assert [cells[1] for cells in shown] == [f"{100 * basins[name]['share']:.2f}" for name in CONTROLLERS]
+    shown = [cells[:2] for cells in page.rows]
+    for name, title in zip(CONTROLLERS, titles, strict=True):
+        assert [title, f"{100 * basins[name]['share']:.2f}"] in shown
+    cards = document(tmp_path, "robustness.json")["cards"]
+    assert list(cards) == ["tuned_place"]
+    assert io.load(tmp_path / "bench.toml").drive.dead_band == 0.2
     assert all((tmp_path / file_of(name)).exists() for name in CONTROLLERS)
     fronts = document(tmp_path, "pareto.json")["fronts"]["lqr"]["rows"]
     rows = [cells for cells in page.rows if cells and cells[0] == "lqr" and cells[1] == "cart_travel"]
