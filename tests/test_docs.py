@@ -42,7 +42,7 @@ def test_every_command_is_shown_somewhere():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["how-to", "tutorial"])
+@pytest.mark.parametrize("page", ["how-to", "tutorial", "rig"])
 def test_its_python_runs(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     text = (DOCS / f"{page}.md").read_text()
@@ -50,3 +50,4 @@ def test_its_python_runs(page, tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "nan" not in printed
     assert "inf" not in printed
+    assert "False" not in printed  # a run that does not settle
