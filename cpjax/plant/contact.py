@@ -11,7 +11,8 @@ and likewise for the pole with the pivot's friction torque. A step of the integr
 `cpjax.sim.plants.Eventful`), so friction is neither smoothed nor creeps: a held cart has x' = 0 exactly.
 
 A stop acts on the cart alone, within no time: x' becomes -`restitution` x', and the pole's row of the equations of
-motion gives (J + m l^2) d(theta') = m l cos(theta) d(x').
+motion gives (J + m l^2) d(theta') = m l cos(theta) d(x'). Likewise where dry friction stops cart or pole late, because
+two events fell into one step: so neither adds energy.
 """
 
 import dataclasses
@@ -56,6 +57,14 @@ class InContact:
     def limits(self) -> State:
         """Largest allowed magnitude of each component of the state."""
         return self.free.limits
+
+    @property
+    def start_limits(self) -> State:
+        """Largest allowed magnitude of each component of an initial state: the cart starts between the stops."""
+        if self.half_length is None:
+            return self.limits
+        # A stop stays allowed after rounding to float32.
+        return dataclasses.replace(self.limits, x=(1.0 + 1e-6) * self.half_length)
 
     @property
     def input_limit(self) -> Scalar:
@@ -128,6 +137,7 @@ class InContact:
         x, x_dot = q[0], v[0]
         theta_dot = v[1]
         sliding = jnp.abs(cart) == 1
+        coupling = self._coupling(self.geometry(q))
         # Guards 0 and 1: a sliding cart has come to rest; a held one is pushed to the right (0) or to the left (1).
         of_cart = (guard == 0) | (guard == 1)
         away = jnp.where(guard == 0, 1, -1)
@@ -138,22 +148,28 @@ class InContact:
         if self.free.pivot_coulomb_friction is not None:
             of_pole = (guard == 2) | (guard == 3)
             turning = jnp.abs(pole) == 1
+            if not self._follows:
+                moved = -coupling * theta_dot / (self.free.moving_mass + self.free.pole_mass)
+                x_dot = x_dot + jnp.where(of_pole & turning & sliding, moved, 0.0)
             theta_dot = jnp.where(of_pole & turning, 0.0, theta_dot)
             pole = jnp.where(of_pole, jnp.where(turning, HELD, jnp.where(guard == 2, 1, -1)), pole)
             number = 4
+        hits = guard >= number
         if self.half_length is not None:
-            hits = guard >= number
             side = jnp.where(guard == number, 1, -1)
-            back = -self.restitution * x_dot
+            # Another event in the same step may have turned the cart already.
+            back = jnp.where(side * x_dot > 0.0, -self.restitution * x_dot, x_dot)
             rebounds = jnp.abs(back) >= _SLOWEST_REBOUND
-            new = jnp.where(rebounds, back, 0.0)
-            turn = self._coupling(self.geometry(q)) * (new - x_dot) / self.free.pivot_inertia
-            theta_dot = jnp.where(hits, theta_dot + turn, theta_dot)
             x = jnp.where(hits, side * self.half_length, x)
-            x_dot = jnp.where(hits, new, x_dot)
+            x_dot = jnp.where(hits, jnp.where(rebounds, back, 0.0), x_dot)
             after = jnp.where(hits, jnp.where(rebounds, -side, AT_STOP * side), after)
-            # A held pole that the impact turns slides from then on.
-            pole = jnp.where(hits & (pole == HELD), jnp.sign(theta_dot).astype(pole.dtype), pole)
+        # What stops the cart acts on the pole too. Dry friction stops what is at rest already, to rounding, unless its
+        # event took effect late.
+        turn = coupling * (x_dot - v[0]) / self.free.pivot_inertia
+        theta_dot = theta_dot + jnp.where(hits | (of_cart & sliding & (pole != HELD)), turn, 0.0)
+        if self.free.pivot_coulomb_friction is not None:
+            # The impact may turn a held pole, or one that slides the other way.
+            pole = jnp.where(hits, jnp.sign(theta_dot).astype(pole.dtype), pole)
         return (x, *q[1:]), (x_dot, theta_dot, *v[2:]), ContactMode(after.astype(cart.dtype), pole.astype(cart.dtype))
 
     def release(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> ContactMode:

@@ -43,11 +43,9 @@ class Pushes:
                 allowed = f"as many as there are times, {np.shape(self.times)[-1]}"
                 raise InputError(f"Pushes.{name}", f"array of shape {np.shape(getattr(self, name))}", allowed)
 
-    def forces(self, time: Float[Array, ""], key: Word, run: Word) -> Forces:
-        """Returns the forces at a time [s]."""
-        # A push begins with the step that begins at its time, up to rounding.
-        since = time - jnp.asarray(self.times) + 1e-4 * self.duration
-        acts = ((since >= 0.0) & (since < self.duration)).astype(time.dtype)
+    def forces(self, time: Float[Array, ""], dt: Scalar, key: Word, run: Word) -> Forces:
+        """Returns the mean forces over a step of `dt` that begins at a time [s]."""
+        acts = _share(time, dt, jnp.asarray(self.times), self.duration)
         return Forces(jnp.sum(acts * jnp.asarray(self.cart)), jnp.sum(acts * jnp.asarray(self.pole)))
 
 
@@ -55,7 +53,7 @@ class Pushes:
 class RandomPushes:
     """One push in each interval of `every` seconds, at a random time in it, to the left or to the right."""
 
-    every: Scalar = number("s", "length of the intervals", default=4.0, above=0.0)
+    every: Scalar = number("s", "length of the intervals, at least one step", default=4.0, above=0.0)
     cart: Scalar = number("N", "magnitude of the force on the cart", default=0.0, at_least=0.0)
     pole: Scalar = number("N", "magnitude of the force on the pole", default=0.0, at_least=0.0)
     duration: Scalar = number("s", "length of each push", default=0.05, above=0.0)
@@ -66,16 +64,30 @@ class RandomPushes:
         if known and not float(self.duration) < float(self.every):
             raise InputError("RandomPushes.duration", self.duration, "below the interval, `every`")
 
-    def forces(self, time: Float[Array, ""], key: Word, run: Word) -> Forces:
-        """Returns the forces at a time [s]."""
-        interval = jnp.floor(time / self.every)
-        a, b = random_bits((key, jnp.asarray(_PUSH)), (run, interval.astype(jnp.uint32)))
-        share = (a >> np.uint32(8)).astype(jnp.int32).astype(time.dtype) * 2.0**-24
-        since = time - interval * self.every - share * (self.every - self.duration)
-        acts = ((since >= 0.0) & (since < self.duration) & (time < self.until)).astype(time.dtype)
-        side_of_cart = 1.0 - 2.0 * (b & np.uint32(1)).astype(jnp.int32).astype(time.dtype)
-        side_of_pole = 1.0 - 2.0 * ((b >> np.uint32(1)) & np.uint32(1)).astype(jnp.int32).astype(time.dtype)
-        return Forces(acts * side_of_cart * self.cart, acts * side_of_pole * self.pole)
+    def forces(self, time: Float[Array, ""], dt: Scalar, key: Word, run: Word) -> Forces:
+        """Returns the mean forces over a step of `dt` that begins at a time [s]; `every` is at least `dt`."""
+        cart = pole = jnp.zeros_like(time)
+        for later in (0.0, 1.0):  # a push of the next interval may begin in this step
+            interval = jnp.floor(time / self.every) + later
+            a, b = random_bits((key, jnp.asarray(_PUSH)), (run, interval.astype(jnp.uint32)))
+            share = (a >> np.uint32(8)).astype(jnp.int32).astype(time.dtype) * 2.0**-24
+            begin = interval * self.every + share * (self.every - self.duration)
+            acts = jnp.where(time < self.until, _share(time, dt, begin, self.duration), 0.0)
+            cart += acts * (1.0 - 2.0 * (b & np.uint32(1)).astype(jnp.int32).astype(time.dtype))
+            pole += acts * (1.0 - 2.0 * ((b >> np.uint32(1)) & np.uint32(1)).astype(jnp.int32).astype(time.dtype))
+        return Forces(cart * self.cart, pole * self.pole)
+
+
+def _share(time: Float[Array, ""], dt: Scalar, begin: Any, duration: Scalar) -> Float[Array, "..."]:
+    """Returns the share of the step from `time` to `time + dt` that lies in a push, so that its impulse is exact.
+
+    Args:
+      time, dt: of the step [s].
+      begin, duration: of the push [s].
+    """
+    ahead = begin - time
+    lies = jnp.minimum(dt, ahead + duration) - jnp.maximum(0.0, ahead)
+    return jnp.maximum(lies, 0.0) / dt
 
 
 @pytree
@@ -88,10 +100,11 @@ class Wind:
     force: Scalar = number("N", "standard deviation of the force on the pole", at_least=0.0)
     correlation_time: Scalar = number("s", "beyond twice this it is uncorrelated", default=0.5, above=0.0)
 
-    def at(self, time: Float[Array, ""], key: Word, run: Word) -> Forces:
-        """Returns the forces at a time [s]."""
-        knot = jnp.floor(time / self.correlation_time)
-        share = time / self.correlation_time - knot
+    def at(self, time: Float[Array, ""], dt: Scalar, key: Word, run: Word) -> Forces:
+        """Returns the forces in a step of `dt` that begins at a time [s]."""
+        distance = jnp.maximum(self.correlation_time, dt)  # below one step the force differs from step to step anyway
+        knot = jnp.floor(time / distance)
+        share = time / distance - knot
         count = knot.astype(jnp.uint32)
         keys = (key, jnp.asarray(_WIND))
         before, _ = standard_normals(keys, (run, count), np.dtype(time.dtype))
@@ -123,20 +136,21 @@ class Disturbance:
         """Whether any of it changes with time."""
         return self.pushes is not None or self.wind is not None
 
-    def forces(self, time: Float[Array, ""], key: Word, run: Word) -> Forces:
-        """Returns the forces of pushes and wind at a time [s].
+    def forces(self, time: Float[Array, ""], dt: Scalar, key: Word, run: Word) -> Forces:
+        """Returns the forces of pushes and wind in a step.
 
         Args:
-          time: since the start.
+          time: of its beginning, since the start [s].
+          dt: its length [s].
           key: seed of the rollout, uint32.
           run: number of the run, uint32.
         """
         zero = jnp.zeros_like(time)
         found = [Forces(zero, zero)]
         if self.pushes is not None:
-            found.append(self.pushes.forces(time, key, run))
+            found.append(self.pushes.forces(time, dt, key, run))
         if self.wind is not None:
-            found.append(self.wind.at(time, key, run))
+            found.append(self.wind.at(time, dt, key, run))
         return Forces(sum(f.cart for f in found), sum(f.pole for f in found))
 
 

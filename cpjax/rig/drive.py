@@ -49,8 +49,13 @@ def line_of_decay(ratio: Scalar) -> tuple[Float[Array, ""], Float[Array, ""]]:
     velocity and position at its end depend on.
     """
     ratio = jnp.asarray(ratio)
-    left = jnp.exp(-ratio)
-    mean = -jnp.expm1(-ratio) / ratio
-    moment = (mean - left) / ratio
-    slope = 12.0 * (moment - 0.5 * mean)
+    slow = ratio < 0.03  # the closed forms below cancel
+    some = jnp.where(slow, 1.0, ratio)
+    left = jnp.exp(-some)
+    mean = -jnp.expm1(-some) / some
+    slope = 12.0 * ((mean - left) / some - 0.5 * mean)
+    first = 1.0 - ratio / 2.0 * (1.0 - ratio / 3.0 * (1.0 - ratio / 4.0 * (1.0 - ratio / 5.0 * (1.0 - ratio / 6.0))))
+    mean = jnp.where(slow, first, mean)
+    terms = 1.0 - ratio / 2.0 * (1.0 - ratio * (3.0 / 10.0) * (1.0 - ratio * (2.0 / 9.0) * (1.0 - ratio * (5.0 / 28.0))))
+    slope = jnp.where(slow, -ratio * terms, slope)
     return mean - 0.5 * slope, slope

@@ -176,7 +176,7 @@ class ChangingBench(OnTheBench):
         if self.disturbance is not None and self.disturbance.changes:
             time = index.astype(jnp.asarray(state.x).dtype) * dt
             key, run = (jnp.asarray(word, dtype=jnp.uint32) for word in (self.seed, self.run))
-            now = dataclasses.replace(now, forces=self.disturbance.forces(time, key, run))
+            now = dataclasses.replace(now, forces=self.disturbance.forces(time, dt, key, run))
         if not self.voltage_changes:
             return now, memory
         value: Any = jnp.asarray(u)
@@ -210,7 +210,10 @@ class ChangingBench(OnTheBench):
         """
         ratio = dt * self.plant.motor.resistance / self.inductance
         at_begin, along = line_of_decay(ratio)
-        behind = slope / ratio
-        gap = before - target + behind
-        line = Line(target - behind + gap * at_begin, (slope + gap * along) / dt)
-        return line, target - behind + slope + gap * jnp.exp(-ratio)
+        gap = before - target
+        line = Line(
+            target + gap * at_begin - slope * (1.0 - at_begin) / ratio,
+            (gap * along + slope * (1.0 + along / ratio)) / dt,
+        )
+        mean = at_begin + 0.5 * along
+        return line, target + gap * jnp.exp(-ratio) + slope * (1.0 - mean)

@@ -22,7 +22,7 @@ def checked_initial(
     """Returns `start` as arrays of one dtype, that dtype, and the number of initial states (None if not `batched`).
 
     Args:
-      plant: the plant, whose limits the initial states must respect.
+      plant: the plant, whose limits (`start_limits`, if it has them) the initial states must respect.
       start: one initial state of scalars or, if `batched`, many, of arrays (n,).
       field: name of the argument in error messages.
       batched: whether `start` holds many initial states.
@@ -31,7 +31,8 @@ def checked_initial(
       InputError: as `checked_tree` does.
     """
     units = getattr(plant, "units", {})
-    return checked_tree(start, plant.limits, units, field, batched=batched)
+    limits = getattr(plant, "start_limits", plant.limits)
+    return checked_tree(start, limits, units, field, batched=batched)
 
 
 def checked_tree(

@@ -146,11 +146,11 @@ def test_random_pushes_wind_and_noise_depend_on_seed_and_place_alone():
     assert float(first.effort) == pytest.approx(float(whole.effort[0]), rel=1e-9)
     # One push in each interval, for its duration; wind of the stated size.
     times, key = jnp.arange(0.0, 4000.0, 0.01), jnp.uint32(3)
-    found = jax.vmap(lambda t: pushes.forces(t, key, jnp.uint32(0)))(times)
+    found = jax.vmap(lambda t: pushes.forces(t, 0.01, key, jnp.uint32(0)))(times)
     share = np.asarray(found.cart).reshape(-1, 50)
     assert np.all(np.abs(np.sum(np.abs(share), axis=1) - 4.0 * 5) <= 4.0)
     assert abs(np.mean(found.cart)) < 0.02
-    wind = np.asarray(jax.vmap(lambda t: disturbance.wind.at(t, key, jnp.uint32(0)).pole)(times))
+    wind = np.asarray(jax.vmap(lambda t: disturbance.wind.at(t, 0.01, key, jnp.uint32(0)).pole)(times))
     assert np.std(wind) == pytest.approx(0.3, rel=0.03)
     assert np.mean(wind[:-40] * wind[40:]) == pytest.approx(0.0, abs=0.003)
 
