@@ -44,9 +44,10 @@ def test_the_python_of_the_design_page_runs():
 def test_the_python_of_the_page_on_gradients_runs(capsys):
     page = (ROOT / "docs" / "gradients.md").read_text()
     exec(compile("\n".join(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)), "gradients.md", "exec"), {})
-    value, slope = map(float, capsys.readouterr().out.split())
+    value, slope, slope_of_the_mean = map(float, capsys.readouterr().out.split())
     assert 0.5 < value < 3.0
     assert abs(slope) > 1e-4
+    assert abs(slope_of_the_mean) > 1e-4
 
 
 def test_the_cpjax_commands_of_the_pages_are_understood():
