@@ -167,12 +167,12 @@ def test_a_plant_of_jax_functions_moves_in_python_control_in_floats(float64):
     np.testing.assert_allclose(found, derivative(ROUGH, columns(state), voltage - less), rtol=1e-12)
 
 
-BEFORE = "    motor: Motor = part("
-ADDED = """    coulomb_friction: Scalar = number("N", "dry friction", default=0.0, at_least=0.0, uncertain=True)
+BEFORE = "    motor: Any = part("
+ADDED = """    smooth_friction: Scalar = number("N", "dry friction", default=0.0, at_least=0.0, uncertain=True)
 """
 TERM = (
     "        push = force - self.cart_friction * x_dot",
-    "        push = force - self.coulomb_friction * jnp.tanh(x_dot / 0.01) - self.cart_friction * x_dot",
+    "        push = force - self.smooth_friction * jnp.tanh(x_dot / 0.01) - self.cart_friction * x_dot",
 )
 
 USES_OF_THE_COPY = """
@@ -194,11 +194,11 @@ from cpjax.paper.plant_fit import PARAMETERS, scale_of
 from cpjax.paper.printed_gains import printed_in_the_paper
 from cpjax.tune.plants import UNCERTAIN, sample_plants
 
-here, name = Path(__file__).parent, "coulomb_friction"
+here, name = Path(__file__).parent, "smooth_friction"
 assert Path(cpjax.__file__).parent.parent == here, cpjax.__file__
 plain = paper.appendix_plant()
 rubbing = with_parameters(plain, {name: 0.3})
-assert plain.coulomb_friction == 0.0 and rubbing.coulomb_friction == 0.3
+assert plain.smooth_friction == 0.0 and rubbing.smooth_friction == 0.3
 
 # Fits of gains
 assert name in PARAMETERS
@@ -210,7 +210,7 @@ assert np.all(np.isfinite([fit.worst for fit in audit.fits]))
 # Random plants
 assert name in UNCERTAIN
 plants = sample_plants(plain, 5, spread=0.2, seed=1)
-assert 0.0 <= np.min(plants.coulomb_friction) < np.max(plants.coulomb_friction) <= 0.2
+assert 0.0 <= np.min(plants.smooth_friction) < np.max(plants.smooth_friction) <= 0.2
 np.testing.assert_array_equal(plants.cart_mass, np.load(here / "cart_mass.npy"))
 np.testing.assert_array_equal(plants.motor.resistance, np.load(here / "resistance.npy"))
 
@@ -218,12 +218,12 @@ np.testing.assert_array_equal(plants.motor.resistance, np.load(here / "resistanc
 controller = paper.controller("corrected-centred", "placement", plain)
 chosen = parametrise(plain, controller)
 assert chosen.scales[name] == 1.0
-assert chosen.build(chosen.parameters | {name: 0.2})[0].coulomb_friction == 0.2
+assert chosen.build(chosen.parameters | {name: 0.2})[0].smooth_friction == 0.2
 
 # Files and the command line
 cpjax.save(here / "rig.toml", rubbing)
-assert cpjax.load(here / "rig.toml").coulomb_friction == 0.3
-(here / "options.toml").write_text("[plant]\\ncoulomb_friction = 0.1\\n")
+assert cpjax.load(here / "rig.toml").smooth_friction == 0.3
+(here / "options.toml").write_text("[plant]\\nsmooth_friction = 0.1\\n")
 for option, text, value in (
     ("--coulomb-friction", "0.1", 0.1),
     ("--config", "options.toml", 0.1),
@@ -238,7 +238,7 @@ model_xml(plain, 1e-3)
 try:
     model_xml(rubbing, 1e-3)
 except cpjax.InputError as problem:
-    assert str(problem).startswith("plant.coulomb_friction = 0.3: ") and "cannot express" in str(problem), problem
+    assert str(problem).startswith("plant.smooth_friction = 0.3: ") and "cannot express" in str(problem), problem
 else:
     raise AssertionError("MuJoCo's model drops the friction")
 state = np.array([0.0, 0.02, 0.3, 0.1])
