@@ -8,9 +8,9 @@ the sampled clock, always with located switching. The derivatives of the final s
 compared with Ridders' extrapolated central differences. An error counts relative to the largest derivative of that
 component of the final state, each multiplied by the size of its parameter.
 
-A difference counts only if both of its runs have the events of the unchanged run, in their order. Where too few do, the
-run nearly touches an event that it does not have (a graze), and the difference's own estimate of its error says so: such
-derivatives are counted apart. Where a loop slides, its derivatives in that friction must not be zero.
+A difference counts only if both of its runs have the events of the unchanged run, in their order. Where too few do,
+the run nearly touches an event that it does not have (a graze), and the difference's own estimate of its error says so:
+such derivatives are counted apart. Where a loop slides, its derivatives in that friction must not be zero.
 """
 
 import dataclasses
@@ -60,7 +60,7 @@ _GROUPS = {
 
 
 class Events(NamedTuple):
-    """A metric: which events a run has, in order, as a number; whether cart and pole slide, and how often they stick."""
+    """A metric: the events of a run in order, as a number; whether cart and pole slide, and how often they stick."""
 
     def init(self, sample: Any) -> Any:
         count = jnp.zeros_like(sample.mode)
@@ -177,7 +177,7 @@ def compare(group: str, count: int, seed: int) -> dict[str, Any]:
         "loops_with_undecided": int(np.sum(np.any(undecided, axis=(1, 2)))),
         "forward_against_reverse": float(np.max(disagree)),
         "worst": float(np.max(error)),
-        "worst_of": [int(worst[0]), "x x_dot theta theta_dot".split()[worst[1]], names[worst[2]]],
+        "worst_of": [int(worst[0]), ("x", "x_dot", "theta", "theta_dot")[worst[1]], names[worst[2]]],
         "median": float(np.median(error[decided])),
         "beyond": int(np.sum(error > BOUND)),
         "zero_though_slid": [int(z) for z in zeros],

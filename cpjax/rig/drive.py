@@ -56,6 +56,8 @@ def line_of_decay(ratio: Scalar) -> tuple[Float[Array, ""], Float[Array, ""]]:
     slope = 12.0 * ((mean - left) / some - 0.5 * mean)
     first = 1.0 - ratio / 2.0 * (1.0 - ratio / 3.0 * (1.0 - ratio / 4.0 * (1.0 - ratio / 5.0 * (1.0 - ratio / 6.0))))
     mean = jnp.where(slow, first, mean)
-    terms = 1.0 - ratio / 2.0 * (1.0 - ratio * (3.0 / 10.0) * (1.0 - ratio * (2.0 / 9.0) * (1.0 - ratio * (5.0 / 28.0))))
+    terms = 1.0 - ratio / 2.0 * (
+        1.0 - ratio * (3.0 / 10.0) * (1.0 - ratio * (2.0 / 9.0) * (1.0 - ratio * (5.0 / 28.0)))
+    )
     slope = jnp.where(slow, -ratio * terms, slope)
     return mean - 0.5 * slope, slope
