@@ -140,7 +140,9 @@ class MovingReference:
         Raises:
           InputError: as many positions as times are needed, and times that rise.
         """
-        return cls(controller, VoltageSignal(times, positions))
+        # VoltageSignal takes lists too, and checks them.
+        given: tuple[Any, Any] = times, positions
+        return cls(controller, VoltageSignal(*given))
 
     @classmethod
     def square_wave(

@@ -101,8 +101,8 @@ class InContact:
 
     def accelerations(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
         """Returns (x'', theta'') [m/s^2, rad/s^2] in the mode; exactly 0 for what is held."""
-        *smooth, others = self._smooth_loads(geometry, v, u)
-        push, torque = self._with_friction(*smooth, mode)
+        smooth_push, smooth_torque, others = self._smooth_loads(geometry, v, u)
+        push, torque = self._with_friction(smooth_push, smooth_torque, mode)
         x_ddot, theta_ddot = self.free.solved(geometry[0], geometry[1], push, torque)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)
@@ -247,7 +247,7 @@ class InContact:
 
     def _holding(self, geometry: Pair, smooth: Any, mode: ContactMode) -> Pair:
         """Returns the force [N] and the torque [N m] that would move cart and pole from rest, their friction apart."""
-        push, torque = self._with_friction(*smooth[:2], mode)
+        push, torque = self._with_friction(smooth[0], smooth[1], mode)
         coupling = self._coupling(geometry)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)

@@ -220,7 +220,7 @@ def test_without_an_encoder_a_film_becomes_a_page(command, tmp_path, monkeypatch
         (("pareto", "--supplies", "nan"), "supplies"),
         (("pareto", "--supplies", "1e300"), "supplies"),
         (("pareto", "--candidates", "1000000000000"), "candidates"),
-        (("basin", "--controllers", "corected/lqr"), "tuned_lqr, tuned_place, a law (as-printed, "),
+        (("basin", "--controllers", "corected/lqr"), "tuned_quanser_ip02_long, a law (as-printed, "),
         (("basin", "--out", "o" * 300), "path = "),
         (("basin", "--controllers", "\udcff.json"), "text in UTF-8"),
         (("animate", "--rate", "0"), "rate"),

@@ -61,11 +61,11 @@ def test_an_oscillator_with_dry_friction_follows_its_closed_form():
     expected[time > halves * math.pi / omega] = x0 - 2 * halves * F / k
     np.testing.assert_allclose(whole.state.x, expected, rtol=0, atol=1e-9)
     assert np.all(np.asarray(whole.state.x_dot)[time > halves * math.pi / omega + 1e-3] == 0.0)
-    for duration, n in ((1.3, 2), (4.0, halves)):  # while it slides, and at rest
-        found = jax.grad(lambda p, t=duration: run(p[0], p[1], t).state.x[-1])(jnp.array([x0, F]))
+    found = jax.jacfwd(lambda p: run(p[0], p[1], 4.0).state.x[np.array([1300, 4000])])(jnp.array([x0, F]))
+    for row, (duration, n) in enumerate(((1.3, 2), (4.0, halves))):  # while it slides, and at rest
         swing = (-1) ** n * math.cos(omega * duration - n * math.pi) if n < halves else 1.0
         slopes = [swing, ((-1) ** n - (2 * n + 1) * swing) / k if n < halves else -2 * n / k]
-        np.testing.assert_allclose(found, slopes, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found[row], slopes, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("clock", CLOCKS)
