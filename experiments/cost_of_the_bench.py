@@ -3,7 +3,8 @@
     python experiments/cost_of_the_bench.py
 
 Two tables, both after `configure_cpu()`. Located: 512 runs under `vmap`, values and gradients in the cart's mass, on
-the continuous clock with dry friction and without. Per step: sweeps of 4,096 `hanging` initial states, both precisions.
+the continuous clock with dry friction and without. Per step: sweeps of 4,096 `hanging` initial states, in both
+precisions.
 Every case is compiled first; then all run in turn, several times, so that a busy machine slows all of them. A ratio is
 that of the medians over the laps.
 """

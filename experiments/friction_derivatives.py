@@ -51,7 +51,7 @@ _RANGES = {
     "weight": (0.1, 2.0),
 }
 _PLANT = tuple(_RANGES)[:8]
-_GROUPS: dict[str, dict[str, Any]] = {
+_GROUPS: Mapping[str, dict[str, Any]] = {
     "hybrid": {"clock": "continuous"},
     "feedback, continuous": {"clock": "continuous"},
     "energy": {"clock": "sampled", "switching": "located", "control_period": 5 * DT},
@@ -98,7 +98,7 @@ def draw(group: str, count: int, seed: int) -> dict[str, Any]:
     """Returns random parameters and initial states, each with a leading axis."""
     rng = np.random.default_rng(seed)
     p: dict[str, Any] = {
-        k: np.exp(rng.uniform(math.log(low), math.log(high), count)) for k, (low, high) in _RANGES.items()
+        k: np.exp(rng.uniform(math.log(ends[0]), math.log(ends[1]), count)) for k, ends in _RANGES.items()
     }
     upright = group.startswith("feedback")
     sizes = {"x": 0.15, "x_dot": 0.4, "theta": 0.25 if upright else 1.0, "theta_dot": 0.5 if upright else 2.0}

@@ -140,9 +140,7 @@ class MovingReference:
         Raises:
           InputError: as many positions as times are needed, and times that rise.
         """
-        # VoltageSignal takes lists too, and checks them.
-        given: tuple[Any, Any] = times, positions
-        return cls(controller, VoltageSignal(*given))
+        return cls(controller, VoltageSignal(_listed(times), _listed(positions)))
 
     @classmethod
     def square_wave(
@@ -208,6 +206,10 @@ class MovingReference:
         returned = call("controller", as_sampled(self.controller), "update", memory.controller, relative)
         inner, command = pair("controller.update", returned, "the new memory and the command")
         return ReferenceMemory(inner, signal), command
+
+
+def _listed(values: Any) -> Any:
+    return values if isinstance(values, (list, tuple)) or hasattr(values, "shape") else np.asarray(values, dtype=float)
 
 
 def _relative(measurement: State, position: Scalar) -> State:

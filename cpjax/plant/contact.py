@@ -16,7 +16,7 @@ two events fell into one step: so neither adds energy.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -34,6 +34,10 @@ _SLOWEST_REBOUND = 1e-3
 
 _NO_END = 1.0
 """Guard of a mode that ends otherwise."""
+
+
+_Loads: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]
+"""Force on the cart [N], torque on the pole [N m]."""
 
 
 class ContactMode(NamedTuple):
@@ -101,8 +105,8 @@ class InContact:
 
     def accelerations(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
         """Returns (x'', theta'') [m/s^2, rad/s^2] in the mode; exactly 0 for what is held."""
-        smooth_push, smooth_torque, others = self._smooth_loads(geometry, v, u)
-        push, torque = self._with_friction(smooth_push, smooth_torque, mode)
+        smooth, others = self._smooth_loads(geometry, v, u)
+        push, torque = self._with_friction(smooth, mode)
         x_ddot, theta_ddot = self.free.solved(geometry[0], geometry[1], push, torque)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)
@@ -125,7 +129,7 @@ class InContact:
     def guards(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> tuple[Scalar, ...]:
         """Returns what ends a mode below zero: of the cart, of the pole, then the distances to the stops."""
         geometry = self.geometry(q)
-        cart, pole = self._holding(geometry, self._smooth_loads(geometry, v, u), mode)
+        cart, pole = self._holding(geometry, self._smooth_loads(geometry, v, u)[0], mode)
         static_x, static_theta = self._static()
         speed = None if self.free.coulomb_friction is None else v[0]
         return (
@@ -181,7 +185,7 @@ class InContact:
         Each is released in turn, with the other's state known: first the cart, then the pole, then the cart again.
         """
         geometry = self.geometry(q)
-        smooth = self._smooth_loads(geometry, v, u)  # the same in every mode
+        smooth, _ = self._smooth_loads(geometry, v, u)  # the same in every mode
         static_x, static_theta = self._static()
         for axis in ("cart", "pole", "cart"):
             cart, pole = self._holding(geometry, smooth, mode)
@@ -211,7 +215,7 @@ class InContact:
         """Returns whether the cart and whether the pole is at rest."""
         return (mode.cart == HELD) | (jnp.abs(mode.cart) == AT_STOP), mode.pole == HELD
 
-    def _smooth_loads(self, geometry: Pair, v: Pair, u: Scalar) -> tuple[Float[Array, ""], Float[Array, ""], Any]:
+    def _smooth_loads(self, geometry: Pair, v: Pair, u: Scalar) -> tuple[_Loads, Any]:
         """Returns force on the cart [N] and torque on the pole [N m] without dry friction, and the accelerations of
         further coordinates."""
         free = self.free
@@ -219,10 +223,11 @@ class InContact:
         coupling = self._coupling(geometry)
         push = x_ddot if self._follows else (free.moving_mass + free.pole_mass) * x_ddot - coupling * theta_ddot
         torque = free.pivot_inertia * theta_ddot - coupling * x_ddot
-        return jnp.asarray(push), jnp.asarray(torque), others
+        return (jnp.asarray(push), jnp.asarray(torque)), others
 
-    def _with_friction(self, push: Any, torque: Any, mode: ContactMode) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def _with_friction(self, smooth: _Loads, mode: ContactMode) -> _Loads:
         """Returns force [N] and torque [N m] with the friction of what slides."""
+        push, torque = smooth
         if self.free.coulomb_friction is not None:
             direction = jnp.where(jnp.abs(mode.cart) == 1, mode.cart, 0).astype(push.dtype)
             push = push - direction * self.free.coulomb_friction
@@ -245,9 +250,9 @@ class InContact:
         alone = push if self._follows else push / (free.moving_mass + free.pole_mass)
         return alone, torque / free.pivot_inertia
 
-    def _holding(self, geometry: Pair, smooth: Any, mode: ContactMode) -> Pair:
+    def _holding(self, geometry: Pair, smooth: _Loads, mode: ContactMode) -> Pair:
         """Returns the force [N] and the torque [N m] that would move cart and pole from rest, their friction apart."""
-        push, torque = self._with_friction(smooth[0], smooth[1], mode)
+        push, torque = self._with_friction(smooth, mode)
         coupling = self._coupling(geometry)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)

@@ -175,7 +175,7 @@ def test_a_line_of_decay_has_mean_and_first_moment_of_the_exponential(dtype):
         mean, moment = (
             (1 / ratio, 1 / ratio**2) if ratio > 1e3 else (np.exp(-ratio * s) @ (weights * p) for p in (1, s))
         )
-        tolerance = 100 * np.finfo(dtype).eps
+        tolerance = 100.0 * float(np.finfo(dtype).eps)
         assert value + slope / 2 == pytest.approx(mean, abs=tolerance)
         assert value / 2 + slope / 3 == pytest.approx(moment, abs=tolerance)
 
