@@ -16,7 +16,7 @@ two events fell into one step: so neither adds energy.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from cpjax.plant.cartpole import Pair
 from cpjax.plant.motor import AccelerationActuator
 from cpjax.plant.state import State
-from cpjax.pytree import Scalar, part, pytree
+from cpjax.pytree import Scalar, number, part, pytree
 
 HELD, AT_STOP = 0, 2
 """Modes: -1 and 1 slide in that direction, `HELD` is at rest, -`AT_STOP` and `AT_STOP` is the cart at that stop."""
@@ -34,6 +34,10 @@ _SLOWEST_REBOUND = 1e-3
 
 _NO_END = 1.0
 """Guard of a mode that ends otherwise."""
+
+
+_Loads: TypeAlias = tuple[Float[Array, ""], Float[Array, ""]]
+"""Force on the cart [N], torque on the pole [N m]."""
 
 
 class ContactMode(NamedTuple):
@@ -48,8 +52,9 @@ class InContact:
     """A `CartPole` with dry friction, stops or both, as the loop integrates it: a `cpjax.sim.plants.Eventful` plant."""
 
     free: Any = part("a cpjax.CartPole, bare or on the bench", "accelerations", "solved")
-    half_length: Scalar | None = None
-    """Stops at this distance from the middle [m]; None for no stops."""
+    half_length: Scalar | None = number(
+        "m", "stops at this distance from the middle; None for no stops", default=None, above=0.0, optional=True
+    )
     restitution: Scalar = 0.0
     """Speed of the cart after a stop to that before [1]."""
 
@@ -100,7 +105,8 @@ class InContact:
 
     def accelerations(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
         """Returns (x'', theta'') [m/s^2, rad/s^2] in the mode; exactly 0 for what is held."""
-        push, torque, others = self._loads(geometry, v, u, mode)
+        smooth, others = self._smooth_loads(geometry, v, u)
+        push, torque = self._with_friction(smooth, mode)
         x_ddot, theta_ddot = self.free.solved(geometry[0], geometry[1], push, torque)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)
@@ -122,7 +128,8 @@ class InContact:
 
     def guards(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> tuple[Scalar, ...]:
         """Returns what ends a mode below zero: of the cart, of the pole, then the distances to the stops."""
-        cart, pole = self._forces(self.geometry(q), v, u, mode)
+        geometry = self.geometry(q)
+        cart, pole = self._holding(geometry, self._smooth_loads(geometry, v, u)[0], mode)
         static_x, static_theta = self._static()
         speed = None if self.free.coulomb_friction is None else v[0]
         return (
@@ -178,9 +185,10 @@ class InContact:
         Each is released in turn, with the other's state known: first the cart, then the pole, then the cart again.
         """
         geometry = self.geometry(q)
+        smooth, _ = self._smooth_loads(geometry, v, u)  # the same in every mode
         static_x, static_theta = self._static()
         for axis in ("cart", "pole", "cart"):
-            cart, pole = self._forces(geometry, v, u, mode)
+            cart, pole = self._holding(geometry, smooth, mode)
             if axis == "pole":
                 loose = (mode.pole == HELD) & (jnp.abs(pole) > static_theta)
                 mode = mode._replace(pole=jnp.where(loose, jnp.sign(pole).astype(mode.pole.dtype), mode.pole))
@@ -207,23 +215,25 @@ class InContact:
         """Returns whether the cart and whether the pole is at rest."""
         return (mode.cart == HELD) | (jnp.abs(mode.cart) == AT_STOP), mode.pole == HELD
 
-    def _loads(
-        self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode
-    ) -> tuple[Float[Array, ""], Float[Array, ""], Any]:
-        """Returns force on the cart [N] and torque on the pole [N m], with the friction of what slides, and the
-        accelerations of further coordinates."""
+    def _smooth_loads(self, geometry: Pair, v: Pair, u: Scalar) -> tuple[_Loads, Any]:
+        """Returns force on the cart [N] and torque on the pole [N m] without dry friction, and the accelerations of
+        further coordinates."""
         free = self.free
         x_ddot, theta_ddot, *others = free.accelerations(geometry, v, u)  # whatever forces the plant has
         coupling = self._coupling(geometry)
         push = x_ddot if self._follows else (free.moving_mass + free.pole_mass) * x_ddot - coupling * theta_ddot
         torque = free.pivot_inertia * theta_ddot - coupling * x_ddot
-        push, torque = jnp.asarray(push), jnp.asarray(torque)
-        if free.coulomb_friction is not None:
+        return (jnp.asarray(push), jnp.asarray(torque)), others
+
+    def _with_friction(self, smooth: _Loads, mode: ContactMode) -> _Loads:
+        """Returns force [N] and torque [N m] with the friction of what slides."""
+        push, torque = smooth
+        if self.free.coulomb_friction is not None:
             direction = jnp.where(jnp.abs(mode.cart) == 1, mode.cart, 0).astype(push.dtype)
-            push = push - direction * free.coulomb_friction
-        if free.pivot_coulomb_friction is not None:
-            torque = torque - mode.pole.astype(torque.dtype) * free.pivot_coulomb_friction
-        return push, torque, others
+            push = push - direction * self.free.coulomb_friction
+        if self.free.pivot_coulomb_friction is not None:
+            torque = torque - mode.pole.astype(torque.dtype) * self.free.pivot_coulomb_friction
+        return push, torque
 
     @property
     def _follows(self) -> bool:
@@ -240,9 +250,9 @@ class InContact:
         alone = push if self._follows else push / (free.moving_mass + free.pole_mass)
         return alone, torque / free.pivot_inertia
 
-    def _forces(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
-        """Returns the force [N] and the torque [N m] that would move cart and pole from rest, friction apart."""
-        push, torque, _ = self._loads(geometry, v, u, mode)
+    def _holding(self, geometry: Pair, smooth: _Loads, mode: ContactMode) -> Pair:
+        """Returns the force [N] and the torque [N m] that would move cart and pole from rest, their friction apart."""
+        push, torque = self._with_friction(smooth, mode)
         coupling = self._coupling(geometry)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)

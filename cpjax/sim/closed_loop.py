@@ -58,32 +58,27 @@ class ContinuousLoop(NamedTuple):
             jnp.where(mode.clip > 0, relative - 1.0, 1.0 - relative),
             jnp.where(mode.clip < 0, -1.0 - relative, 1.0 + relative),
             margin.astype(dtype_of(state)),
-            *plants.guards(self.plant, q, v, u, mode.plant),
+            *plant_guards(self.plant, q, v, u, mode.plant),
         )
         return Observation(plant_accelerations(self.plant, q, v, u, mode.plant), guards, u)
 
     def jump(self, q: Tree, v: Tree, mode: Mode, guard: Int[Array, ""]) -> tuple[Tree, Tree, Mode]:
-        state = plants.state_of(self.plant, q, v)
         successor = integer("controller.successor", call("controller", self.controller, "successor", mode.law))
         law = jnp.where(guard == GATE, successor, mode.law)
+        of_plant, own = mode.plant, guard > GATE
+        if plants.has_events(self.plant):
+            after = outline(plants.jump)(self.plant, q, v, mode.plant, guard - (GATE + 1))
+            q, v, of_plant = jax.tree.map(lambda new, old: jnp.where(own, new, old), after, (q, v, mode.plant))
+        state = plants.state_of(self.plant, q, v)
         now = self._clip(state, law)
         # On the limit itself the sign is rounding error and is ignored. A demand that has jumped past the other limit
         # is clipped there.
         inside = jnp.where(now == -mode.clip, now, 0)
         clip = jnp.where(mode.clip == 0, jnp.where(guard == UPPER, 1, -1), inside)
-        clip = jnp.where(guard == GATE, now, clip).astype(mode.clip.dtype)
-        if not plants.has_events(self.plant):
-            return q, v, Mode(law, clip, mode.plant)
-        own = guard > GATE
-        before = self._applied(state, mode.law, mode.clip)
-        after_q, after_v, after = plants.jump(self.plant, q, v, before, mode.plant, guard - (GATE + 1))
-        q, v, of_plant = jax.tree.map(
-            lambda new, old: jnp.where(own, new, old), (after_q, after_v, after), (q, v, mode.plant)
-        )
-        # A jump of the plant's state may move the demand beyond a limit, and one of the demand may release the plant.
-        state = plants.state_of(self.plant, q, v)
-        clip = jnp.where(own, self._clip(state, law).astype(clip.dtype), clip)
-        of_plant = plants.release(self.plant, q, v, self._applied(state, law, clip), of_plant)
+        clip = jnp.where((guard == GATE) | own, now, clip).astype(mode.clip.dtype)
+        # A jump of the plant's state may have moved the demand beyond a limit, and one of the demand may release it.
+        if plants.has_events(self.plant):
+            of_plant = outline(plants.release)(self.plant, q, v, self._applied(state, law, clip), of_plant)
         return q, v, Mode(law, clip, of_plant)
 
     def start_mode(self, start: Tree) -> Mode:
@@ -122,12 +117,12 @@ class HeldLoop(NamedTuple):
     plant: Plant
 
     def observe(self, q: Tree, v: Tree, mode: HeldMode) -> Observation:
-        guards = plants.guards(self.plant, q, v, mode.u, mode.plant)
+        guards = plant_guards(self.plant, q, v, mode.u, mode.plant)
         return Observation(plant_accelerations(self.plant, q, v, mode.u, mode.plant), guards, mode.u)
 
     def jump(self, q: Tree, v: Tree, mode: HeldMode, guard: Int[Array, ""]) -> tuple[Tree, Tree, HeldMode]:
-        q, v, of_plant = plants.jump(self.plant, q, v, mode.u, mode.plant, guard)
-        return q, v, mode._replace(plant=of_plant)
+        q, v, of_plant = outline(plants.jump)(self.plant, q, v, mode.plant, guard)
+        return q, v, mode._replace(plant=outline(plants.release)(self.plant, q, v, mode.u, of_plant))
 
 
 System: TypeAlias = ContinuousLoop | HeldLoop
@@ -137,3 +132,8 @@ def plant_accelerations(plant: Plant, q: Tree, v: Tree, u: Float[Array, ""], mod
     """Returns the accelerations q'' under the input `u`, in the plant's own mode."""
     geometry = plants.geometry(plant, q)
     return outline(plants.accelerations)(plant, geometry, v, u, mode)
+
+
+def plant_guards(plant: Plant, q: Tree, v: Tree, u: Float[Array, ""], mode: Tree) -> tuple[Any, ...]:
+    """Returns the plant's own guards, () for a plant without events."""
+    return outline(plants.guards)(plant, q, v, u, mode) if plants.has_events(plant) else ()

@@ -71,7 +71,8 @@ def step_with_event(
     share = share + jnp.where(sought, jnp.clip(correction, -share, 1.0 - share), 0.0)
     share = jnp.where(falls, share, 1.0)
     q_there, v_there = at(share)
-    q_new, v_new, mode_new = plants.jump(plant, q_there, v_there, u, mode, number)
+    q_new, v_new, mode_new = plants.jump(plant, q_there, v_there, mode, number)
+    mode_new = plants.release(plant, q_new, v_new, u, mode_new)
     q_rest, v_rest = integrator(accelerations(mode_new), q_new, v_new, (1.0 - share) * dt, None)
     return _chosen(falls, (q_rest, v_rest, mode_new), (q_end, v_end, mode))
 

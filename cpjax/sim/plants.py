@@ -257,8 +257,9 @@ def guards(plant: Plant, q: Tree, v: Tree, u: Float[Array, ""], mode: Tree) -> t
     return tuple(real(f"plant.guards[{i}]", guard, jnp.asarray(u).dtype) for i, guard in enumerate(found))
 
 
-def jump(plant: Any, q: Tree, v: Tree, u: Scalar, mode: Tree, guard: Int[Array, ""]) -> tuple[Tree, Tree, Tree]:
-    """Returns positions, velocities and the plant's mode after its own guard of this number (int32) has fallen.
+def jump(plant: Any, q: Tree, v: Tree, mode: Tree, guard: Int[Array, ""]) -> tuple[Tree, Tree, Tree]:
+    """Returns positions, velocities and the plant's mode after its own guard of this number (int32) has fallen, before
+    its `release`.
 
     Raises:
       InputError: the plant's `jump` returns another tree structure.
@@ -268,7 +269,7 @@ def jump(plant: Any, q: Tree, v: Tree, u: Scalar, mode: Tree, guard: Int[Array, 
     if found != jax.tree.structure((q, v, mode)):
         raise InputError("plant.jump", str(found), "positions, velocities and mode, as given")
     q, v, mode = jax.tree.map(lambda new, old: jnp.asarray(new, dtype=jnp.asarray(old).dtype), after, (q, v, mode))
-    return q, v, release(plant, q, v, u, mode)
+    return q, v, mode
 
 
 def outputs(plant: Plant, state: PlantState, acceleration: Tree, u: Scalar) -> dict[str, Float[Array, ""]]:

@@ -30,6 +30,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from cpjax.backend.single_kernel import outline
 from cpjax.numeric.roots import crossing_fraction, newton_correction
 from cpjax.pytree import Scalar
 from cpjax.sim.integrators import Integrator, Step
@@ -130,25 +131,8 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) ->
 
     # What follows only searches for the crossing: Newton's corrections carry its derivative, steps that are tried have
     # none (`stop_gradient`).
-    # The first guard to fall, if any. The one whose crossing is being located is about zero, of either sign; another
-    # one that falls at the same time is located afterwards.
-    soonest, first = jnp.full_like(step, jnp.inf), jnp.zeros_like(motion.guard)
-    for number, (before, after) in enumerate(zip(current.guards, trial.guards, strict=True)):
-        sought = locating & (motion.guard == number)
-        fallen = (after < 0.0) & (step > 0.0) & ~landed & (~sought | missed)
-        above = jnp.maximum(before, 0.0)
-        secant = jnp.where(fallen, lax.stop_gradient(above / jnp.where(fallen, above - after, 1.0)), jnp.inf)
-        secant = jnp.where(locating & ~sought & (secant > 1.0 - room / dt), jnp.inf, secant)
-        first = jnp.where(secant < soonest, number, first).astype(motion.guard.dtype)
-        soonest = jnp.minimum(secant, soonest)
-    fell = soonest < jnp.inf
-    fraction = crossing_fraction(
-        pick(current.guards, first),
-        step * pick(motion.slopes, first),
-        pick(trial.guards, first),
-        step * pick(slopes, first),
-    )
-    fraction = jnp.where(missed, 0.5, fraction)
+    search = motion.slopes, trial.guards, slopes, step, locating, landed, missed, motion.guard, dt
+    fell, first, fraction = outline(_first_crossing)(*lax.stop_gradient((current.guards, *search)))
 
     short = missed & ~fell  # short of the crossing: continue from this point
     refine = locating & ~fell & ~short & (phase < _CORRECTIONS)
@@ -187,6 +171,40 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) ->
         ),
         reached,
     )
+
+
+def _first_crossing(
+    before: Guards,
+    slopes_before: Guards,
+    after: Guards,
+    slopes_after: Guards,
+    step: Step,
+    locating: Bool[Array, ""],
+    landed: Bool[Array, ""],
+    missed: Bool[Array, ""],
+    sought: Int[Array, ""],
+    dt: Step,
+) -> tuple[Bool[Array, ""], Int[Array, ""], Float[Array, ""]]:
+    """Returns whether a guard fell in a step, the number of the first one, and the fraction of the step at which it
+    did.
+
+    The one whose crossing is being located (`sought`) is about zero, of either sign; another one that falls at the same
+    time is located afterwards.
+    """
+    room = dt * float(np.finfo(dt.dtype).eps) ** 0.5
+    soonest, first = jnp.full_like(step, jnp.inf), jnp.zeros_like(sought)
+    for number, (one, other) in enumerate(zip(before, after, strict=True)):
+        this = locating & (sought == number)
+        fallen = (other < 0.0) & (step > 0.0) & ~landed & (~this | missed)
+        above = jnp.maximum(one, 0.0)
+        secant = jnp.where(fallen, above / jnp.where(fallen, above - other, 1.0), jnp.inf)
+        secant = jnp.where(locating & ~this & (secant > 1.0 - room / dt), jnp.inf, secant)
+        first = jnp.where(secant < soonest, number, first).astype(sought.dtype)
+        soonest = jnp.minimum(secant, soonest)
+    fraction = crossing_fraction(
+        pick(before, first), step * pick(slopes_before, first), pick(after, first), step * pick(slopes_after, first)
+    )
+    return soonest < jnp.inf, first, jnp.where(missed, 0.5, fraction)
 
 
 def observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, Guards, list[Float[Array, "..."]]]:
