@@ -162,6 +162,8 @@ class MovingReference:
             Number("s", name, above=0.0).normalise(name, value)
         Number("m", "amplitude").normalise("amplitude", amplitude)
         Number("s", "begin", at_least=0.0).normalise("begin", begin)
+        if duration > 1e6 * period:
+            raise InputError("duration", duration, "at most a million periods")
         count = max(1, math.ceil(2.0 * duration / period - 1e-9))
         times = begin + 0.5 * period * np.arange(count)
         return cls.steps(controller, times, amplitude * (-1.0) ** np.arange(count))
@@ -207,7 +209,7 @@ class MovingReference:
 
 
 def _listed(values: Any) -> Any:
-    return values if hasattr(values, "shape") else np.asarray(values, dtype=float)
+    return values if isinstance(values, (list, tuple)) or hasattr(values, "shape") else np.asarray(values, dtype=float)
 
 
 def _relative(measurement: State, position: Scalar) -> State:

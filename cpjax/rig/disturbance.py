@@ -53,7 +53,7 @@ class Pushes:
 class RandomPushes:
     """One push in each interval of `every` seconds, at a random time in it, to the left or to the right."""
 
-    every: Scalar = number("s", "length of the intervals, at least one step", default=4.0, above=0.0)
+    every: Scalar = number("s", "length of the intervals", default=4.0, above=0.0)
     cart: Scalar = number("N", "magnitude of the force on the cart", default=0.0, at_least=0.0)
     pole: Scalar = number("N", "magnitude of the force on the pole", default=0.0, at_least=0.0)
     duration: Scalar = number("s", "length of each push", default=0.05, above=0.0)
@@ -65,17 +65,15 @@ class RandomPushes:
             raise InputError("RandomPushes.duration", self.duration, "below the interval, `every`")
 
     def forces(self, time: Float[Array, ""], dt: Scalar, key: Word, run: Word) -> Forces:
-        """Returns the mean forces over a step of `dt` that begins at a time [s]; `every` is at least `dt`."""
-        cart = pole = jnp.zeros_like(time)
-        for later in (0.0, 1.0):  # a push of the next interval may begin in this step
-            interval = jnp.floor(time / self.every) + later
-            a, b = random_bits((key, jnp.asarray(_PUSH)), (run, interval.astype(jnp.uint32)))
-            share = (a >> np.uint32(8)).astype(jnp.int32).astype(time.dtype) * 2.0**-24
-            begin = interval * self.every + share * (self.every - self.duration)
-            acts = jnp.where(time < self.until, _share(time, dt, begin, self.duration), 0.0)
-            cart += acts * (1.0 - 2.0 * (b & np.uint32(1)).astype(jnp.int32).astype(time.dtype))
-            pole += acts * (1.0 - 2.0 * ((b >> np.uint32(1)) & np.uint32(1)).astype(jnp.int32).astype(time.dtype))
-        return Forces(cart * self.cart, pole * self.pole)
+        """Returns the mean forces over a step of `dt` that begins at a time [s]."""
+        interval = jnp.floor((time + 0.5 * dt) / self.every)
+        a, b = random_bits((key, jnp.asarray(_PUSH)), (run, interval.astype(jnp.uint32)))
+        share = (a >> np.uint32(8)).astype(jnp.int32).astype(time.dtype) * 2.0**-24
+        begin = interval * self.every + share * (self.every - self.duration)
+        acts = jnp.where(time < self.until, _share(time, dt, begin, self.duration), 0.0)
+        side_of_cart = 1.0 - 2.0 * (b & np.uint32(1)).astype(jnp.int32).astype(time.dtype)
+        side_of_pole = 1.0 - 2.0 * ((b >> np.uint32(1)) & np.uint32(1)).astype(jnp.int32).astype(time.dtype)
+        return Forces(acts * side_of_cart * self.cart, acts * side_of_pole * self.pole)
 
 
 def _share(time: Float[Array, ""], dt: Scalar, begin: Any, duration: Scalar) -> Float[Array, "..."]:

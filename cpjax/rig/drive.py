@@ -54,8 +54,11 @@ def line_of_decay(ratio: Scalar) -> tuple[Float[Array, ""], Float[Array, ""]]:
     left = jnp.exp(-some)
     mean = -jnp.expm1(-some) / some
     slope = 12.0 * ((mean - left) / some - 0.5 * mean)
-    first = 1.0 - ratio / 2.0 * (1.0 - ratio / 3.0 * (1.0 - ratio / 4.0 * (1.0 - ratio / 5.0 * (1.0 - ratio / 6.0))))
+    first = terms = jnp.ones_like(ratio)
+    for share in (1 / 7, 1 / 6, 1 / 5, 1 / 4, 1 / 3, 1 / 2):  # Taylor series
+        first = 1.0 - ratio * share * first
+    for share in (3 / 20, 5 / 28, 2 / 9, 3 / 10, 1 / 2):
+        terms = 1.0 - ratio * share * terms
     mean = jnp.where(slow, first, mean)
-    terms = 1.0 - ratio / 2.0 * (1.0 - ratio * (3.0 / 10.0) * (1.0 - ratio * (2.0 / 9.0) * (1.0 - ratio * (5.0 / 28.0))))
     slope = jnp.where(slow, -ratio * terms, slope)
     return mean - 0.5 * slope, slope

@@ -216,4 +216,4 @@ class ChangingBench(OnTheBench):
             (gap * along + slope * (1.0 + along / ratio)) / dt,
         )
         mean = at_begin + 0.5 * along
-        return line, target + gap * jnp.exp(-ratio) + slope * (1.0 - mean)
+        return line, jnp.asarray(target + gap * jnp.exp(-ratio) + slope * (1.0 - mean))

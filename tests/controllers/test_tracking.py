@@ -106,6 +106,8 @@ def test_derivatives_through_integral_and_reference_are_those_of_differences():
         (lambda: IntegralAction.designed(HYBRID, PLANT, Q, R, integral_weight=0.0), "integral_weight"),
         (lambda: IntegralAction.designed(HYBRID.regulator, PLANT, Q, R, integral_weight=1.0), "controller"),
         (lambda: MovingReference.steps(HYBRID, [1.0, 0.5], [0.0, 1.0]), "times"),
+        (lambda: MovingReference.steps(HYBRID, ["a"], [0.0]), "times"),
+        (lambda: MovingReference.square_wave(HYBRID, amplitude=0.1, period=1e-12, duration=1e6), "duration"),
         (lambda: MovingReference.square_wave(HYBRID, amplitude=0.1, period=0.0, duration=1.0), "period"),
         (lambda: MovingReference.from_file(HYBRID, "nothing.csv"), "path"),
     ],

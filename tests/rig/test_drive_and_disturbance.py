@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import cpjax
 from cpjax import Disturbance, Drive, InputError, Pushes, RandomPushes, Rig, State, VoltageSignal, Wind, paper
+from cpjax.rig.drive import line_of_decay
 
 PLANT = rough_plant()
 LAW = paper.controller("corrected-centred", "lqr", PLANT, "computed")
@@ -153,6 +154,30 @@ def test_random_pushes_wind_and_noise_depend_on_seed_and_place_alone():
     wind = np.asarray(jax.vmap(lambda t: disturbance.wind.at(t, 0.01, key, jnp.uint32(0)).pole)(times))
     assert np.std(wind) == pytest.approx(0.3, rel=0.03)
     assert np.mean(wind[:-40] * wind[40:]) == pytest.approx(0.0, abs=0.003)
+
+
+def test_a_push_shorter_than_a_step_has_its_impulse():
+    pushes, key = Pushes(times=[0.1013], cart=[100.0], pole=[3.0], duration=1e-4), jnp.uint32(3)
+    times = jnp.arange(0.0, 0.5, 0.002)
+    found = jax.vmap(lambda t: pushes.forces(t, 0.002, key, jnp.uint32(0)))(times)
+    assert float(jnp.sum(found.cart) * 0.002) == pytest.approx(100.0 * 1e-4, rel=1e-9)
+    fast = Wind(force=0.3, correlation_time=1e-12)
+    wind = jax.vmap(lambda t: fast.at(t, 0.002, key, jnp.uint32(0)).pole)(times)
+    assert len(np.unique(wind)) == len(times)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_line_of_decay_has_mean_and_first_moment_of_the_exponential(dtype):
+    for ratio in (1e-9, 1e-4, 0.0299, 0.0301, 1.0, 40.0, 1e9):
+        value, slope = (np.float64(number) for number in line_of_decay(dtype(ratio)))
+        s, weights = np.polynomial.legendre.leggauss(200)
+        s, weights = 0.5 + 0.5 * s, 0.5 * weights
+        mean, moment = (
+            (1 / ratio, 1 / ratio**2) if ratio > 1e3 else (np.exp(-ratio * s) @ (weights * p) for p in (1, s))
+        )
+        tolerance = 100.0 * float(np.finfo(dtype).eps)
+        assert value + slope / 2 == pytest.approx(mean, abs=tolerance)
+        assert value / 2 + slope / 3 == pytest.approx(moment, abs=tolerance)
 
 
 def test_derivatives_through_drive_and_disturbance_are_those_of_differences():
