@@ -8,9 +8,9 @@ the sampled clock, always with located switching. The derivatives of the final s
 compared with Ridders' extrapolated central differences. An error counts relative to the largest derivative of that
 component of the final state, each multiplied by the size of its parameter.
 
-A difference counts only if both of its runs have the events of the unchanged run, in their order. Where too few do, the
-run nearly touches an event that it does not have (a graze), and the difference's own estimate of its error says so: such
-derivatives are counted apart. Where a loop slides, its derivatives in that friction must not be zero.
+A difference counts only if both of its runs have the events of the unchanged run, in their order. Where too few do,
+the run nearly touches an event that it does not have (a graze), and the difference's own estimate of its error says so:
+such derivatives are counted apart. Where a loop slides, its derivatives in that friction must not be zero.
 """
 
 import dataclasses
@@ -51,7 +51,7 @@ _RANGES = {
     "weight": (0.1, 2.0),
 }
 _PLANT = tuple(_RANGES)[:8]
-_GROUPS = {
+_GROUPS: Mapping[str, dict[str, Any]] = {
     "hybrid": {"clock": "continuous"},
     "feedback, continuous": {"clock": "continuous"},
     "energy": {"clock": "sampled", "switching": "located", "control_period": 5 * DT},
@@ -60,7 +60,7 @@ _GROUPS = {
 
 
 class Events(NamedTuple):
-    """A metric: which events a run has, in order, as a number; whether cart and pole slide, and how often they stick."""
+    """A metric: the events of a run in order, as a number; whether cart and pole slide, and how often they stick."""
 
     def init(self, sample: Any) -> Any:
         count = jnp.zeros_like(sample.mode)
@@ -97,7 +97,9 @@ def build(group: str, p: Mapping[str, Any]) -> tuple[cpjax.CartPole, Any]:
 def draw(group: str, count: int, seed: int) -> dict[str, Any]:
     """Returns random parameters and initial states, each with a leading axis."""
     rng = np.random.default_rng(seed)
-    p: dict[str, Any] = {k: np.exp(rng.uniform(*np.log(ends), count)) for k, ends in _RANGES.items()}
+    p: dict[str, Any] = {
+        k: np.exp(rng.uniform(math.log(ends[0]), math.log(ends[1]), count)) for k, ends in _RANGES.items()
+    }
     upright = group.startswith("feedback")
     sizes = {"x": 0.15, "x_dot": 0.4, "theta": 0.25 if upright else 1.0, "theta_dot": 0.5 if upright else 2.0}
     start = {k: rng.uniform(-size, size, count) for k, size in sizes.items()}
@@ -177,7 +179,7 @@ def compare(group: str, count: int, seed: int) -> dict[str, Any]:
         "loops_with_undecided": int(np.sum(np.any(undecided, axis=(1, 2)))),
         "forward_against_reverse": float(np.max(disagree)),
         "worst": float(np.max(error)),
-        "worst_of": [int(worst[0]), "x x_dot theta theta_dot".split()[worst[1]], names[worst[2]]],
+        "worst_of": [int(worst[0]), ("x", "x_dot", "theta", "theta_dot")[worst[1]], names[worst[2]]],
         "median": float(np.median(error[decided])),
         "beyond": int(np.sum(error > BOUND)),
         "zero_though_slid": [int(z) for z in zeros],

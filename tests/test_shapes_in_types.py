@@ -206,6 +206,7 @@ def calls():
         "plant.cartpole.CartPole.vector_field": call(plant, state, 1.0),
         "plant.contact.in_contact": call(plant, 0.4, 0.5),
         "plant.contact.InContact.limits": call(touching),
+        "plant.contact.InContact.start_limits": call(touching),
         "plant.contact.InContact.input_limit": call(touching),
         "plant.contact.InContact.units": call(touching),
         "plant.contact.InContact.coordinates": call(touching, state),

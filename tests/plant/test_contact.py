@@ -1,7 +1,9 @@
 """Dry friction that sticks, and stops: against closed forms, event-located SciPy and differences, on both clocks."""
 
 import dataclasses
+import importlib
 import math
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -208,6 +210,58 @@ def test_derivatives_through_stick_and_slip_are_those_of_differences(clock):
         # Per step, what slips between two samples slides from the second on: right to first order.
         tolerance = {"rel": 1e-6} if clock.get("switching", clock["clock"]) != "sampled" else {"rel": 0.05, "abs": 2e-3}
         assert float(gradient[i] * p[i]) == pytest.approx(float(found), **tolerance)
+
+
+@pytest.mark.parametrize("switching", ["per_step", "located"])
+def test_neither_friction_nor_stops_add_energy(switching):
+    plant = dataclasses.replace(DRY, coulomb_friction=1.0, motor=ForceActuator())
+    rng, n = np.random.default_rng(0), 60
+    starts = State(*(rng.uniform(-size, size, n) for size in (0.19, 3.0, 3.0, 12.0)))
+    # Some steps contain several events: rebounds from a stop that the pole presses the cart against, and reversals.
+    rig = Rig(plant, track=Track(half_length=0.2, ends="stop", restitution=np.resize([0.0, 0.5, 1.0], n)))
+    settings = {"duration": 1.0, "dt": 1e-3, "clock": "sampled", "switching": switching}
+    settings |= {"spare_steps": 3000} if switching == "located" else {}
+    run = cpjax.sweep(rig, cpjax.VoltageSignal([0.0], [0.0]), starts, save_every=1, **settings)
+    assert not np.any(run.flag)
+    energy = np.asarray(jax.vmap(jax.vmap(plant.total_energy))(run.state))
+    assert np.max(np.diff(energy, axis=1)) <= 1e-9
+    assert np.min(energy[:, 0] - energy[:, -1]) > 0.1
+
+
+def test_a_pole_that_a_stop_turns_round_slides_the_other_way():
+    rig = Rig(DRY, track=Track(half_length=0.2, ends="stop", restitution=1.0))
+    start = State(0.199, 2.0, 0.1, 0.5)  # the impact gives the pole about -5 rad/s
+    for switching in ("per_step", "located"):
+        settings = {"duration": 0.01, "dt": 1e-3, "clock": "sampled", "switching": switching}
+        end = cpjax.rollout(rig, cpjax.VoltageSignal([0.0], [0.0]), start, **settings).state.theta_dot[-1]
+        kick = DRY.pole_mass * DRY.pole_length * math.cos(0.1) * -4.0 / DRY.pivot_inertia
+        assert float(end) == pytest.approx(0.5 + kick, abs=0.3)
+
+
+def test_a_cart_does_not_start_beyond_a_stop():
+    rig = Rig(PLANT, track=Track(half_length=0.2, ends="stop"))
+    at = jax.tree.map(np.float32, State(0.2, 0.0, 3.0, 0.0))  # a little more than 0.2 after rounding
+    assert int(cpjax.rollout(rig, LAW, at, duration=0.02, dt=2e-3).flag) == 0
+    with pytest.raises(InputError, match=r"start\.x"):
+        cpjax.rollout(rig, LAW, State(0.21, 0.0, 3.0, 0.0), duration=0.02, dt=2e-3)
+
+
+def test_each_run_of_a_sweep_may_have_a_track_of_its_own():
+    lengths = np.array([0.1, 0.2, 0.3])
+    rig = Rig(PLANT, track=Track(half_length=lengths, ends="stop"))
+    starts = State(np.zeros(3), np.zeros(3), np.full(3, 3.0), np.zeros(3))
+    signal = cpjax.VoltageSignal([0.0], [10.0])
+    run = cpjax.sweep(rig, signal, starts, duration=1.0, dt=2e-3, save_every=500)
+    np.testing.assert_array_equal(run.state.x[:, -1], lengths)
+
+
+@pytest.mark.slow
+def test_derivatives_of_random_loops_with_friction_are_those_of_differences(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "experiments"))
+    for row in importlib.import_module("friction_derivatives").main(tmp_path, count=24):
+        assert row["forward_against_reverse"] < 1e-9
+        assert row["worst"] < 1e-6
+        assert row["undecided"] == row["flagged"] == row["nonfinite"] == sum(row["zero_though_slid"]) == 0
 
 
 @pytest.mark.parametrize(
