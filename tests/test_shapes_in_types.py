@@ -216,7 +216,6 @@ def calls():
         "plant.contact.InContact.geometry_near": call(touching, (0.6, 0.8), (0.01, 0.01)),
         "plant.contact.InContact.accelerations": call(touching, (0.6, 0.8), (0.1, 0.2), 1.0, contact),
         "plant.contact.InContact.outputs": call(touching, state, (0.1, 0.2), 1.0),
-        "plant.contact.InContact.start_limits": call(touching),
         "plant.contact.InContact.start_mode": call(touching, (0.1, 0.2), (0.3, 0.4)),
         "plant.contact.InContact.guards": call(touching, (0.1, 0.2), (0.3, 0.4), 1.0, contact),
         "plant.contact.InContact.jump": call(touching, (0.1, 0.2), (0.3, 0.4), contact, jnp.asarray(0, jnp.int32)),
