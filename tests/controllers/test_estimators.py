@@ -143,6 +143,7 @@ def test_with_a_known_delay_the_law_acts_on_the_state_that_its_command_meets():
     assert acting("runge-kutta", 4, 0) >= 1.0
 
 
+@pytest.mark.slow
 def test_derivatives_through_a_filtered_loop_are_those_of_finite_differences():
     sensors = cpjax.Encoders(x_step=1e-14, theta_step=1e-14, x_noise=1e-3, theta_noise=1e-3)
     filtering = KalmanFilter(PLANT, 1e-3, 2e-3, kind="extended")

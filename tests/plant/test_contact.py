@@ -191,9 +191,8 @@ def test_a_cart_pressed_against_a_stop_stays_until_it_is_pulled_away():
     assert int(run.flag) == 0
 
 
-@pytest.mark.parametrize(
-    "clock", [pytest.param(one, marks=pytest.mark.slow) if one["clock"] == "sampled" else one for one in CLOCKS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("clock", CLOCKS)
 def test_derivatives_through_stick_and_slip_are_those_of_differences(clock):
     start = State(0.02, 0.4, math.pi - 0.9, 0.0)
 

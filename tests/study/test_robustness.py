@@ -36,6 +36,7 @@ def successes(rig, starts, seed=4):
     return int(np.sum(cpjax.sweep(rig, LAW, starts, metrics=protocol_of(rig), **settings).success))
 
 
+@pytest.mark.slow
 def test_every_grid_of_a_card_is_the_sweep_that_it_stands_for(card):
     starts = initial_states(RIG, 6, 4)
     assert int(card.nominal.successes[0]) == successes(RIG, starts)
@@ -59,6 +60,7 @@ def test_every_grid_of_a_card_is_the_sweep_that_it_stands_for(card):
     assert float(pushes.values[2]) == pytest.approx(2.0 * 0.5 * 9.81)
 
 
+@pytest.mark.slow
 def test_scores_are_means_with_wilsons_intervals(card):
     for criterion in card.criteria:
         total = sum(int(np.sum(grid.successes)) for grid in criterion.grids)
