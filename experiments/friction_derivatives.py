@@ -73,7 +73,8 @@ class Events(NamedTuple):
         code = 1 + sample.crossing + 16 * (now.cart + 3) + 128 * (now.pole + 3)
         moving = sample.elapsed > 0.0
         slid = jax.tree.map(lambda s, m: s | (moving & (jnp.abs(m) == 1)).astype(s.dtype), slid, tuple(now))
-        stuck = jax.tree.map(lambda s, b, n: s + ((b != 0) & (n == 0)), stuck, tuple(before), tuple(now))
+        stops = [((b != 0) & (n == 0)).astype(n.dtype) for b, n in zip(before, now, strict=True)]
+        stuck = jax.tree.map(jnp.add, stuck, tuple(stops))
         return jnp.where(changed, 1_000_003 * order + code, order), now, slid, stuck
 
     def finalize(self, memory: Any, last: Any) -> Any:

@@ -225,13 +225,13 @@ cpjax.save(here / "rig.toml", rubbing)
 assert cpjax.load(here / "rig.toml").smooth_friction == 0.3
 (here / "options.toml").write_text("[plant]\\nsmooth_friction = 0.1\\n")
 for option, text, value in (
-    ("--coulomb-friction", "0.1", 0.1),
+    ("--smooth-friction", "0.1", 0.1),
     ("--config", "options.toml", 0.1),
     ("--plant", "rig.toml", 0.3),
 ):
     assert cli.main(["swingup", "--duration", "0.1", "--out", "out", option, text]) == 1  # it does not settle so soon
     assert json.loads((here / "out" / "swingup.json").read_text())["plant"][name] == value
-assert cli.main(["swingup", "--coulomb-friction", "-0.1", "--out", "out"]) == 2
+assert cli.main(["swingup", "--smooth-friction", "-0.1", "--out", "out"]) == 2
 
 # Bridges
 model_xml(plain, 1e-3)
