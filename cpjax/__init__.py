@@ -5,7 +5,8 @@ for one initial state or a million. Importing it starts no JAX backend, loads no
 JAX's settings.
 """
 
-from cpjax import startup as _startup  # noqa: F401  # must be first: the other imports take a second
+# First, and for its effect alone: an interrupt during the imports below, which take a second, then ends quietly.
+from cpjax import startup as _startup  # noqa: F401  # nothing here uses the name
 
 # isort: split
 import importlib

@@ -70,7 +70,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         module = types.ModuleType(spec.name, f"Old name of {now}.")
         real = importlib.import_module(now)
         # A module of its own rather than the real one: the import system writes its name and spec into it.
-        module.__getattr__ = lambda name: getattr(real, name)  # type: ignore[method-assign]  # a hook to be set (PEP 562)
+        vars(module)["__getattr__"] = lambda name: getattr(real, name)  # the hook of PEP 562
         return module
 
     def exec_module(self, module: types.ModuleType) -> None:

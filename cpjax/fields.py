@@ -279,8 +279,9 @@ def config(cls: type[T]) -> type[T]:
         if own_check is not None:
             own_check(self)
 
-    cls.__post_init__ = post_init  # type: ignore[attr-defined]  # mypy does not see attributes added to a class
-    made: Any = dataclasses.dataclass(frozen=True)(cls)
+    made: Any = cls
+    made.__post_init__ = post_init
+    made = dataclasses.dataclass(frozen=True)(cls)
     lines = [f"  {name}: {r.help}{f' [{r.unit}]' if r.unit else ''}." for name, r in rules(made).items()]
     made.__doc__ = "\n".join([inspect.cleandoc(made.__doc__), "", "Attributes:", *lines])
     checked: type[T] = made
@@ -304,8 +305,8 @@ def renamed(**names: str) -> Callable[[type[T]], type[T]]:
                 given[names[old]] = given.pop(old)
             make(self, *values, **given)
 
-        cls.__init__ = init  # type: ignore[method-assign]  # mypy allows no new one; it takes old names
-        cls.RENAMED = names  # type: ignore[attr-defined]  # mypy does not see attributes added to a class
+        changed: Any = cls
+        changed.__init__, changed.RENAMED = init, names
         return cls
 
     return accept

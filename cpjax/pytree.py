@@ -82,9 +82,10 @@ def pytree(cls: type[T]) -> type[T]:
         if own_check is not None:
             own_check(self)
 
-    cls.__post_init__ = post_init  # type: ignore[attr-defined]  # mypy does not see attributes added to a class
+    made: Any = cls
+    made.__post_init__ = post_init
     # Equality stays identity: comparing fields that hold arrays has no single truth value.
-    made: Any = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    made = dataclasses.dataclass(frozen=True, eq=False)(cls)
     declared = rules(made)
     constant = [name for name, rule in declared.items() if isinstance(rule, (Choice, Count))]
     names = [field.name for field in dataclasses.fields(made) if field.name not in constant]

@@ -115,6 +115,13 @@ def derivative(plant, s, voltage):
     return np.array([s[1], x_ddot, s[3], theta_ddot])
 
 
+def oracle_of(plant, law):
+    """The NumPy form of a Hybrid with a corrected, centred law, a gain and an angle gate, with this plant as model."""
+    names = ("energy_gain", "cart_stiffness", "cart_damping", "kick", "kick_radius")
+    terms = {name: getattr(law.swing_up, name) for name in names}
+    return HybridOracle(plant, law.regulator.K, law.gate.half_angle, **terms)
+
+
 class HybridOracle:
     """The corrected swing-up law, a linear law and an angle gate without hysteresis, on the law's own plant."""
 

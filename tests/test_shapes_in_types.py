@@ -35,7 +35,9 @@ def public_things():
                 if not inspect.isclass(thing):
                     yield from [f"{package}.{info.name}.{name}"] if callable(thing) else []
                 elif not getattr(thing, "_is_protocol", False):
-                    for member, value in vars(thing).items():
+                    own = [c for c in reversed(thing.__mro__) if c is thing or c.__name__.startswith("_")]
+                    members = {member: value for one in own for member, value in vars(one).items()}
+                    for member, value in members.items():
                         if not member.startswith("_") and isinstance(
                             value, (type(public_things), property, classmethod)
                         ):
@@ -201,6 +203,7 @@ def calls():
         "plant.cartpole.CartPole.outputs": call(plant, state, (0.1, 0.2), 1.0),
         "plant.cartpole.CartPole.moving_mass": call(plant),
         "plant.cartpole.CartPole.pivot_inertia": call(plant),
+        "plant.cartpole.CartPole.natural_frequency": call(plant),
         "plant.cartpole.CartPole.acceleration": call(plant, 0.6, 0.8, (0.1, 0.2), 1.0),
         "plant.cartpole.CartPole.solved": call(plant, 0.6, 0.8, 0.1, 0.2),
         "plant.cartpole.CartPole.vector_field": call(plant, state, 1.0),

@@ -134,7 +134,8 @@ def _run(arguments: list[str], set_up: bool) -> int:
             warnings.simplefilter("always", DamagedFileWarning)
             warnings.showwarning = lambda message, *_, **__: complain(f"cpjax {options.command}: warning: {message}")
     # The protocol's figures are float64. Set here, in the application: the library never changes this setting.
-    jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # JAX has no annotations for it
+    config: Any = jax.config  # whose methods JAX does not annotate
+    config.update("jax_enable_x64", True)
     try:
         with np.errstate(all="ignore"):  # an overflow shows in the result, or in the one line of an error
             code: int = options.run(options)

@@ -23,7 +23,7 @@ class Stream(io.TextIOBase):
         self.problem: OSError | None = None
 
     @property
-    def encoding(self) -> str:  # type: ignore[override]  # a plain attribute there
+    def encoding(self) -> str:  # type: ignore[override]  # typeshed has a plain attribute; here it is the other stream's
         """The encoding of the other stream."""
         return getattr(self._stream, "encoding", None) or "utf-8"
 

@@ -28,7 +28,14 @@ from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.presets import PRESETS
 from cpjax.rig import Rig, plant_of
-from cpjax.study.robustness import RobustnessCard, RobustnessConfig, duration_of, robustness_card, target_bands
+from cpjax.study.robustness import (
+    RobustnessCard,
+    RobustnessConfig,
+    document,
+    duration_of,
+    robustness_card,
+    target_bands,
+)
 
 _LAWS = ("corrected-centred/lqr", "corrected-centred/placement")
 _TUNED = (PRESETS["lqr"], PRESETS["placement"])
@@ -94,19 +101,15 @@ def run(given: argparse.Namespace) -> int:
     cards, _ = run_robustness(given.out, rig, controllers, settings, notes, firmware)
     seconds = time.perf_counter() - begin
     print_table(*table(cards), text_columns=1)
-    angle, position = target_bands(rig if isinstance(rig, Rig) else Rig(rig))
-    runs = sum(runs_of(card) for card in cards.values())
+    bench = rig if isinstance(rig, Rig) else Rig(rig)
+    angle, position = target_bands(bench)
+    runs = sum(card.runs for card in cards.values())
     say(
         f"Settled: within {angle:g} rad and {position:g} m, at least 1 s before the end of "
-        f"{duration(rig, settings):g} s. {runs:,} runs in {seconds:.1f} s, compilation and files included.",
+        f"{duration_of(bench, settings.dt):g} s. {runs:,} runs in {seconds:.1f} s, compilation and files included.",
         f"wrote {given.out / _JSON} and {given.out / _PICTURE}",
     )
     return 0
-
-
-def duration(rig: Rig | CartPole, settings: RobustnessConfig) -> float:
-    """Returns the length of each run [s]."""
-    return duration_of(rig if isinstance(rig, Rig) else Rig(rig), settings.dt)
 
 
 def run_robustness(
@@ -157,39 +160,6 @@ def run_robustness(
     from cpjax.show.robustness import robustness_figure
 
     return cards, save_figure(out / _PICTURE, robustness_figure(cards))
-
-
-def document(card: RobustnessCard) -> dict[str, Any]:
-    """Returns a card as plain values, for JSON."""
-
-    def grid(one: Any) -> dict[str, Any]:
-        return {
-            "name": one.name,
-            "unit": one.unit,
-            "values": one.values.tolist(),
-            "successes": one.successes.tolist(),
-            "trials": one.trials,
-            "intervals": one.intervals.tolist(),
-        }
-
-    return {
-        "nominal": grid(card.nominal),
-        "criteria": {
-            one.name: {
-                "title": one.title,
-                "score": one.score,
-                "interval": list(one.interval),
-                "grids": [grid(each) for each in one.grids],
-            }
-            for one in card.criteria
-        },
-        "together": grid(card.together),
-    }
-
-
-def runs_of(card: RobustnessCard) -> int:
-    """Returns the number of runs of a card."""
-    return card.nominal.trials + card.together.trials + sum(criterion.runs for criterion in card.criteria)
 
 
 def table(cards: Mapping[str, RobustnessCard]) -> tuple[str, list[str], list[list[str]]]:

@@ -58,7 +58,8 @@ class VoltageSignal:
 
     def update(self, memory: SignalMemory, measurement: object) -> tuple[SignalMemory, Scalar]:
         """Returns the new memory and the voltage of this instant [V]."""
-        times = lax.stop_gradient(jnp.asarray(self.times))  # only searched: a control instant does not move with them
+        # The times are only compared with the control instants, which do not move with them: a derivative would be 0.
+        times = lax.stop_gradient(jnp.asarray(self.times))
         voltages = jnp.asarray(self.voltages)
         count = times.shape[0]
 

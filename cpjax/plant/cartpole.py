@@ -187,6 +187,11 @@ class CartPole:
         """Inertia of the pole about its pivot, J + m l^2 [kg m^2]."""
         return self.pole_inertia + self.pole_mass * self.pole_length * self.pole_length
 
+    @property
+    def natural_frequency(self) -> Scalars:
+        """Frequency of small swings of the hanging pole, cart held, sqrt(m g l / (J + m l^2)) [rad/s]."""
+        return jnp.sqrt(self.pole_mass * self.gravity * self.pole_length / self.pivot_inertia)
+
     def acceleration(
         self, sin: Scalars, cos: Scalars, rates: tuple[Scalars, Scalars], force: Scalars
     ) -> tuple[Scalars, Scalars]:

@@ -121,15 +121,14 @@ class LumpedMotor:
         return (force + self.damping * x_dot) * (1.0 / self.force_per_voltage)
 
 
-@pytree
-class ForceActuator:
-    """A drive without dynamics: the command is the force on the cart [N], and "voltage" means that force."""
+class _Direct:
+    """A drive without dynamics: the plant takes the clipped command as it is."""
 
-    limit: Scalars = number("N", "|force| is clipped here", default=10.0, above=0.0, infinite=True, linear=False)
+    limit: Scalars
 
     @property
     def voltage_limit(self) -> Scalars:
-        """The limit of the command [N]."""
+        """The limit of the command, in its unit."""
         return self.limit
 
     @property
@@ -144,24 +143,31 @@ class ForceActuator:
 
     @property
     def force_per_voltage(self) -> float:
-        """Force per command: 1."""
+        """Force, or acceleration, per command: 1."""
         return 1.0
 
     def saturate(self, command: Scalars) -> Float[Array, "*batch"]:
-        """Clips the commanded force [N]; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
+        """Clips the command, in its unit; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
         return jnp.maximum(-self.limit, jnp.minimum(self.limit, command))
 
     def force(self, command: Scalars, x_dot: Scalars) -> Scalars:
-        """Returns the force on the cart [N], the command itself."""
+        """Returns the force on the cart [N], or in its place the cart's acceleration [m/s^2]: the command itself."""
         return command
 
     def voltage_for_force(self, force: Scalars, x_dot: Scalars) -> Scalars:
-        """Returns the command for a force [N], the force itself."""
+        """Returns the command for a force [N], or for an acceleration [m/s^2]: that itself."""
         return force
 
 
 @pytree
-class AccelerationActuator:
+class ForceActuator(_Direct):
+    """A drive without dynamics: the command is the force on the cart [N], and "voltage" means that force."""
+
+    limit: Scalars = number("N", "|force| is clipped here", default=10.0, above=0.0, infinite=True, linear=False)
+
+
+@pytree
+class AccelerationActuator(_Direct):
     """A drive that prescribes the cart's acceleration: the command is x'' [m/s^2], and "voltage" means it.
 
     Servo and stepper drives with a fast inner loop are modelled like this: the cart follows whatever the pole's force
@@ -170,35 +176,3 @@ class AccelerationActuator:
     """
 
     limit: Scalars = number("m/s^2", "|x''| is clipped here", default=10.0, above=0.0, infinite=True, linear=False)
-
-    @property
-    def voltage_limit(self) -> Scalars:
-        """The limit of the command [m/s^2]."""
-        return self.limit
-
-    @property
-    def reflected_mass(self) -> float:
-        """Mass that the drive adds to the cart: none."""
-        return 0.0
-
-    @property
-    def damping(self) -> float:
-        """Damping that the drive adds to the cart: none."""
-        return 0.0
-
-    @property
-    def force_per_voltage(self) -> float:
-        """Acceleration per command: 1."""
-        return 1.0
-
-    def saturate(self, command: Scalars) -> Float[Array, "*batch"]:
-        """Clips the commanded acceleration [m/s^2]; the derivative is 1 inside, 0 outside, 1/2 on the limit."""
-        return jnp.maximum(-self.limit, jnp.minimum(self.limit, command))
-
-    def force(self, command: Scalars, x_dot: Scalars) -> Scalars:
-        """Returns the cart's acceleration [m/s^2], the command itself, in the place of a force."""
-        return command
-
-    def voltage_for_force(self, force: Scalars, x_dot: Scalars) -> Scalars:
-        """Returns the command for an acceleration [m/s^2] in the place of a force, the acceleration itself."""
-        return force

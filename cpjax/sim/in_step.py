@@ -18,17 +18,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from cpjax.backend.single_kernel import outline
-from cpjax.numeric.roots import crossing_fraction, newton_correction
+from cpjax.numeric.roots import newton_correction
 from cpjax.sim import plants
 from cpjax.sim.integrators import Acceleration, Integrator
 from cpjax.sim.plants import Plant, Tree
-from cpjax.sim.switching import Guards, pick
+from cpjax.sim.switching import Guards, first_crossing, pick
 
 _Motion: TypeAlias = tuple[Tree, Tree]
 """Positions and velocities."""
+
+_NOT, _NONE = np.bool_(False), np.int32(0)
+"""No guard's crossing is being located when a step begins."""
 
 
 def step_with_event(
@@ -53,11 +56,10 @@ def step_with_event(
     last = accelerations(mode)(q_end, v_end)
     before, slopes_before = _guards(plant, q, v, first, u, mode)
     after, slopes_after = _guards(plant, q_end, v_end, last, u, mode)
-    number, falls = _first_to_fall(before, after)
+    # Only searches: Newton's correction below carries the crossing's derivative, so the search needs none.
+    search = lax.stop_gradient((before, slopes_before, after, slopes_after, dt))
+    falls, number, share = outline(first_crossing)(*search, _NOT, _NOT, _NOT, _NONE, search[-1])
     start, end = pick(before, number), pick(after, number)
-    share = crossing_fraction(
-        start, dt * pick(slopes_before, number), jnp.where(falls, end, -1.0), dt * pick(slopes_after, number)
-    )
     share = jnp.where(start > 0.0, share, 0.0)  # a guard that is below zero already ends its mode now
 
     def at(share: Float[Array, ""]) -> _Motion:
@@ -82,22 +84,11 @@ def _guards(
 ) -> tuple[Guards, Guards]:
     """Returns the guards, and their rates of change, which are not differentiable."""
     found = plants.guards(plant, q, v, u, mode)
+    # Rates guide the search, and scale a correction that is zero to rounding: their own derivative has no effect.
     rates = lax.stop_gradient((v, acceleration))
     here = lax.stop_gradient((q, v))
     _, slopes = jax.jvp(lambda q, v: plants.guards(plant, q, v, u, mode), here, rates)
     return found, lax.stop_gradient(slopes)
-
-
-def _first_to_fall(before: Guards, after: Guards) -> tuple[Int[Array, ""], Any]:
-    """Returns the number of the guard that falls first by the secants, int32, and whether any falls."""
-    soonest, number = jnp.full_like(before[0], jnp.inf), jnp.zeros_like(before[0], dtype=jnp.int32)
-    for k, (one, other) in enumerate(zip(before, after, strict=True)):
-        fallen = other < 0.0
-        above = jnp.maximum(one, 0.0)
-        secant = jnp.where(fallen, above / jnp.where(fallen, above - other, 1.0), jnp.inf)
-        number = jnp.where(secant < soonest, np.int32(k), number)
-        soonest = jnp.minimum(secant, soonest)
-    return number, soonest < jnp.inf
 
 
 def _interpolated(q: Tree, v: Tree, first: Tree, v_end: Tree, last: Tree, dt: Any, share: Float[Array, ""]) -> _Motion:

@@ -149,7 +149,8 @@ def prepared(
         allowed = (
             "sampled, with switching per step: pushes, wind, a drive's lag and inductance change from step to step"
         )
-        raise InputError("clock" if settings.clock == "continuous" else "switching", settings.clock, allowed)
+        field = "clock" if settings.clock == "continuous" else "switching"
+        raise InputError(field, getattr(settings, field), allowed)
     name = "starts" if batched else "start"
     start, dtype, count = checked_initial(plant, start, name, batched=batched)
     controller = without_design(as_controller(controller))

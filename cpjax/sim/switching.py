@@ -132,7 +132,7 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) ->
     # What follows only searches for the crossing: Newton's corrections carry its derivative, steps that are tried have
     # none (`stop_gradient`).
     search = motion.slopes, trial.guards, slopes, step, locating, landed, missed, motion.guard, dt
-    fell, first, fraction = outline(_first_crossing)(*lax.stop_gradient((current.guards, *search)))
+    fell, first, fraction = outline(first_crossing)(*lax.stop_gradient((current.guards, *search)))
 
     short = missed & ~fell  # short of the crossing: continue from this point
     refine = locating & ~fell & ~short & (phase < _CORRECTIONS)
@@ -173,7 +173,7 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) ->
     )
 
 
-def _first_crossing(
+def first_crossing(
     before: Guards,
     slopes_before: Guards,
     after: Guards,

@@ -132,8 +132,7 @@ def _force(rig: Rig) -> list[Figure]:
     dead_band = float(getattr(rig.drive, "dead_band", 0.0))
     if dead_band:
         figures.append(Figure("dead_band_share", "dead band, share of the supply", dead_band / supply, "1"))
-    weight = float(plant.pole_mass * plant.gravity * plant.pole_length)
-    swing = 2.0 * math.pi * math.sqrt(float(plant.pivot_inertia) / weight)
+    swing = 2.0 * math.pi / float(plant.natural_frequency)
     return [*figures, Figure("swing_period", "period of small swings, hanging, cart held", swing, "s")]
 
 

@@ -1,7 +1,7 @@
 """Robustness card: success rates of a controller on its rig, when the rig is not quite what it was designed for.
 
-Six criteria, after those of the RealAIGym benchmark of double pendulums (Wiebe et al., 2022), with success rates and
-their intervals in place of a majority vote: wrong parameters of the plant one at a time, noise of the sensors, noise of
+Six criteria, after those of the RealAIGym benchmark of double pendulums, with success rates and their intervals in
+place of a majority vote: wrong parameters of the plant one at a time, noise of the sensors, noise of
 the voltage, a lag of the drive, a delay, and pushes. The score of a criterion is the mean success rate over its grid.
 Beside them: all parameters of the plant wrong at once.
 """
@@ -109,6 +109,11 @@ class RobustnessCard(NamedTuple):
     together: Grid
     """Success with all parameters of the plant wrong at once."""
 
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return self.nominal.trials + self.together.trials + sum(criterion.runs for criterion in self.criteria)
+
 
 class _Part(NamedTuple):
     """Grid to be run, and what differs from the rig as it is: arrays (values * trials,) by name."""
@@ -199,6 +204,34 @@ def robustness_card(
     return RobustnessCard(nominal, criteria, together)
 
 
+def document(card: RobustnessCard) -> dict[str, Any]:
+    """Returns a card as plain values, for JSON."""
+
+    def grid(one: Grid) -> dict[str, Any]:
+        return {
+            "name": one.name,
+            "unit": one.unit,
+            "values": one.values.tolist(),
+            "successes": one.successes.tolist(),
+            "trials": one.trials,
+            "intervals": one.intervals.tolist(),
+        }
+
+    return {
+        "nominal": grid(card.nominal),
+        "criteria": {
+            one.name: {
+                "title": one.title,
+                "score": one.score,
+                "interval": list(one.interval),
+                "grids": [grid(each) for each in one.grids],
+            }
+            for one in card.criteria
+        },
+        "together": grid(card.together),
+    }
+
+
 def initial_states(rig: Rig, number_of_states: int, seed: int) -> State:
     """Returns `hanging` initial states (n,), the cart within a quarter of the half track if that is less than 0.1 m."""
     starts = sample_starts("hanging", number_of_states, seed=seed)
@@ -207,15 +240,9 @@ def initial_states(rig: Rig, number_of_states: int, seed: int) -> State:
     return dataclasses.replace(starts, x=starts.x * min(1.0, 0.25 * float(rig.track.half_length) / 0.1))
 
 
-def natural_period(plant: CartPole) -> float:
-    """Returns the period of small oscillations of the hanging pole, cart held [s]."""
-    stiffness = float(plant.pole_mass) * float(plant.gravity) * float(plant.pole_length)
-    return 2.0 * math.pi * math.sqrt(float(plant.pivot_inertia) / stiffness)
-
-
 def duration_of(rig: Rig, dt: float) -> float:
     """Returns the length of a run: 20 s, or 12 natural periods if that is longer, in whole steps of `dt` [s]."""
-    return dt * math.ceil(max(20.0, 12.0 * natural_period(rig.plant)) / dt - 1e-9)
+    return dt * math.ceil(max(20.0, 24.0 * math.pi / float(rig.plant.natural_frequency)) / dt - 1e-9)
 
 
 def target_bands(rig: Rig) -> tuple[float, float]:

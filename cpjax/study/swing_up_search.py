@@ -174,7 +174,7 @@ def _laws(drawn: Float[np.ndarray, "laws numbers"], rig: Rig) -> Pump:
         weight = float(plant.moving_mass + plant.pole_mass) * float(plant.gravity)
         supply = float(plant.motor.voltage_for_force(weight, 0.0))
     length = float(plant.pole_length) if rig.track is None else float(rig.track.half_length)
-    frequency = _frequency(plant)
+    frequency = float(plant.natural_frequency)
     amplitude, sharpness, _, stiffness, damping = (10.0**drawn).T
     amplitude = supply * amplitude
     return Pump(
@@ -187,16 +187,10 @@ def _laws(drawn: Float[np.ndarray, "laws numbers"], rig: Rig) -> Pump:
     )
 
 
-def _frequency(plant: CartPole) -> float:
-    """Returns the frequency of small swings of the hanging pendulum, the cart held [rad/s]."""
-    weight = float(plant.pole_mass) * float(plant.gravity) * float(plant.pole_length)
-    return math.sqrt(weight / float(plant.pivot_inertia))
-
-
 def _timing(plant: CartPole) -> dict[str, Any]:
     """Returns duration and dt [s]: fine against the swings and against the fastest linear mode."""
     A, _ = linearize(plant)
-    swing = 2.0 * math.pi / _frequency(plant)
+    swing = 2.0 * math.pi / float(plant.natural_frequency)
     fastest = float(np.max(np.abs(np.linalg.eigvals(np.asarray(A, float)))))
     dt = min(swing / 200.0, 0.3 / fastest)
     steps = min(_MOST_STEPS, math.ceil(_PERIODS * swing / dt))

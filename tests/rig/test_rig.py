@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.extend.random import threefry_2x32
-from oracles import HybridOracle, derivative
+from oracles import derivative, oracle_of
 
 import cpjax
 from cpjax import Digital, Drive, Encoders, FilteredDerivative, InputError, Rig, State, Track, paper
@@ -25,17 +25,7 @@ FIRMWARE = Digital(LAW, FilteredDerivative(cutoff=300.0), dead_band=0.4)
 
 def swung_by_numpy(dt, steps, every, delay, dead_band):
     """The loop of FIRMWARE on a rig, sample by sample: states (steps + 1, 4) and applied voltages (steps + 1,)."""
-    energy = LAW.swing_up
-    oracle = HybridOracle(
-        PLANT,
-        LAW.regulator.K,
-        LAW.gate.half_angle,
-        energy_gain=energy.energy_gain,
-        cart_stiffness=energy.cart_stiffness,
-        cart_damping=energy.cart_damping,
-        kick=energy.kick,
-        kick_radius=energy.kick_radius,
-    )
+    oracle = oracle_of(PLANT, LAW)
     period = every * dt
     kept = math.exp(-300.0 * period)
     s = np.array([START.x, START.x_dot, START.theta, START.theta_dot])
