@@ -24,7 +24,7 @@ test-slow: .venv/ready-test  ## the tests that take minutes
 check: .venv/ready-test
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 
 format: .venv/ready-test  ## puts the code into the form that `make check` wants
 	$(BIN)/ruff format .

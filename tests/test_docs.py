@@ -41,6 +41,14 @@ def test_every_command_is_shown_somewhere():
     assert [name for name in commands if f"    cpjax {name}" not in shown] == []
 
 
+def test_the_rig_file_that_it_shows_is_a_rig(tmp_path):
+    (shown,) = re.findall(r"```toml\n(.*?)```", (DOCS / "rig.md").read_text(), flags=re.DOTALL)
+    (tmp_path / "mine.toml").write_text(shown)
+    rig = cpjax.load(tmp_path / "mine.toml")
+    assert isinstance(rig, cpjax.Rig)
+    assert rig.drive.delay == 0.003
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["how-to", "tutorial", "rig"])
 def test_its_python_runs(page, tmp_path, monkeypatch, capsys):

@@ -200,6 +200,7 @@ def calls():
         "plant.cartpole.CartPole.geometry": call(plant, (0.1, 0.2)),
         "plant.cartpole.CartPole.geometry_near": call(plant, (0.6, 0.8), (0.01, 0.01)),
         "plant.cartpole.CartPole.accelerations": call(plant, (0.6, 0.8), (0.1, 0.2), 1.0),
+        "plant.cartpole.CartPole.loads": call(plant, (0.6, 0.8), (0.1, 0.2), 1.0),
         "plant.cartpole.CartPole.outputs": call(plant, state, (0.1, 0.2), 1.0),
         "plant.cartpole.CartPole.moving_mass": call(plant),
         "plant.cartpole.CartPole.pivot_inertia": call(plant),

@@ -223,14 +223,14 @@ def saved(path: str, field: str) -> Controller:
         raise InputError(field, path, allowed) from problem
 
 
-def named_hybrid(name: str, plant: CartPole) -> Hybrid:
+def named_controller(name: str, plant: CartPole) -> Controller:
     """Builds a controller from one word: a preset, a file, or the paper's LAW/DESIGN or LAW/DESIGN/GAINS.
 
     Args:
       plant: the model of the paper's laws, and the plant for which gains are computed.
 
     Raises:
-      InputError: another name, or a file without a Hybrid.
+      InputError: another name, or a file without a controller.
     """
     law, *others = name.split("/")
     if law in paper.LAWS and Path(name).suffix.lower() not in (".json", ".toml"):
@@ -239,7 +239,16 @@ def named_hybrid(name: str, plant: CartPole) -> Hybrid:
                 chosen = gains if len(others) == 2 else default_gains(plant)
                 return paper.controller(law, design, plant, chosen)
         raise InputError("controller", name, f"{law}/lqr or {law}/placement, and after it /printed or /computed")
-    controller = saved_controller(name, f"a law ({', '.join(paper.LAWS)}) with its regulator, such as corrected/lqr, ")
+    return saved_controller(name, f"a law ({', '.join(paper.LAWS)}) with its regulator, such as corrected/lqr, ")
+
+
+def named_hybrid(name: str, plant: CartPole) -> Hybrid:
+    """Builds a controller as `named_controller` does, for commands that need a regulator behind a gate.
+
+    Raises:
+      InputError: as `named_controller` does, or a controller of another kind.
+    """
+    controller = named_controller(name, plant)
     if not isinstance(controller, Hybrid):
         raise InputError("controller", name, "a Hybrid: a regulator behind a gate")
     return controller

@@ -45,7 +45,9 @@ def add_command(commands: Any) -> None:
         "Says what moves and how fast, how finely it is measured, what the linear model asks of the control period, "
         "whether track and supply allow a swing-up, and what the rig does not say. Writes rig.json."
     )
-    checked = actions.add_parser("check", help="what a rig can do, and what it does not say", description=text)
+    checked = actions.add_parser(
+        "check", help="what a rig can do, and what its file leaves at ideal values", description=text
+    )
     _add_name(checked)
     add_options(checked, CHECK_OPTIONS, out="out/rig")
     checked.set_defaults(run=run_check, many_starts=True)

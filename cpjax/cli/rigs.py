@@ -171,6 +171,8 @@ class Firmware:
     estimator: Any = None
     dead_band: float = 0.0
     """Dead band that commands are raised beyond [V]."""
+    delay: int = 0
+    """Control periods over which the estimator predicts."""
     simulation: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Further arguments of a rollout: its control period [s] and, on a rig, the seed of the sensors' noise."""
     notes: tuple[str, ...] = ()
@@ -179,14 +181,14 @@ class Firmware:
         """Returns the firmware around a controller; one that is firmware already stays as it is."""
         if self.estimator is None or isinstance(controller, Digital):
             return controller
-        return Digital(controller, self.estimator, dead_band=self.dead_band)
+        return Digital(controller, self.estimator, dead_band=self.dead_band, delay=self.delay)
 
     def entries(self) -> dict[str, Any]:
         """Returns the entry `firmware` of a result, as plain values; none for a controller alone."""
         if self.estimator is None:
             return {}
-        described = {"estimator": io.encode(self.estimator), "dead_band": self.dead_band, **self.simulation}
-        return {"firmware": described}
+        described = {"estimator": io.encode(self.estimator), "dead_band": self.dead_band, "delay": self.delay}
+        return {"firmware": {**described, **self.simulation}}
 
 
 BARE = Firmware()
@@ -223,6 +225,7 @@ def build_firmware(
     if "cutoff" in given and kind != "derivative":
         raise InputError("cutoff", given["cutoff"], "absent unless the estimator is derivative")
     dead_band = float(getattr(drive, "dead_band", 0.0))
+    wait = float(getattr(drive, "delay", 0.0))
     if setting.get("clock") == "continuous":
         # A rollout itself refuses sensors and delay there. It clips located demands without asking the drive.
         if given.get("estimator", "none") != "none":
@@ -233,6 +236,7 @@ def build_firmware(
     if kind == "none":
         band = f"commands within the drive's dead band of {dead_band:g} V have no effect, and nothing raises them"
         return Firmware(simulation=simulation, notes=(band,) if dead_band else ())
+    delay = 0
     if kind == "kalman":
         if not isinstance(sensors, (Encoders, Potentiometers)):
             raise InputError("estimator", kind, "derivative or none, on a plant whose rates are measured")
@@ -242,13 +246,17 @@ def build_firmware(
             x_deviation=_deviation(getattr(sensors, "x_step", _FINEST), sensors.x_noise),
             theta_deviation=_deviation(getattr(sensors, "theta_step", _FINEST), sensors.theta_noise),
         )
+        delay = round(wait / period)
         words = f"a Kalman filter designed for the plant and a control period of {period:g} s"
     else:
         estimator = FilteredDerivative(given.get("cutoff", _CUTOFF))
         words = f"a filtered derivative with a cutoff of {float(estimator.cutoff):g} rad/s"
     raised = f"; commands are raised beyond the drive's dead band of {dead_band:g} V" if dead_band else ""
-    note = f"the controller gets x and theta alone, every {period:g} s; {words} estimates the rates{raised}"
-    return Firmware(estimator, dead_band, simulation, (note,))
+    late = f"; the drive's delay of {wait:g} s is not predicted" if wait else ""
+    if delay:
+        late = f" and predicts them over {delay} period{'s' * (delay > 1)}, the drive's delay of {wait:g} s"
+    note = f"the controller gets x and theta alone, every {period:g} s; {words} estimates the rates{late}{raised}"
+    return Firmware(estimator, dead_band, delay, simulation, (note,))
 
 
 def _deviation(step: Any, noise: Any) -> float:

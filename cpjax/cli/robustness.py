@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cpjax import files, io
-from cpjax.cli.builders import PLANT_OPTIONS, controller_title, named_hybrid
+from cpjax.cli.builders import PLANT_OPTIONS, controller_title, named_controller
 from cpjax.cli.notes import announce, notes_on
 from cpjax.cli.options import Option, add_options, options_of, resolve
 from cpjax.cli.output import say
@@ -23,7 +23,8 @@ from cpjax.cli.rigs import (
     with_usual_period,
 )
 from cpjax.cli.tables import print_table
-from cpjax.controllers import Hybrid
+from cpjax.controllers import Digital
+from cpjax.controllers.protocol import Controller
 from cpjax.errors import InputError
 from cpjax.plant import CartPole
 from cpjax.presets import PRESETS
@@ -86,13 +87,14 @@ def run(given: argparse.Namespace) -> int:
     names = chosen.pop("controllers", list(DEFAULT) if own is None else [*_LAWS, own])
     if len(set(names)) < len(names):
         raise InputError("controllers", names, "each one once")
-    controllers = {name: named_hybrid(name, plant) for name in names}
+    controllers = {name: named_controller(name, plant) for name in names}
     estimation = dict(sections["firmware"])
     stated = {key: chosen[key] for key in ("dt",) if key in chosen}
     if "control_period" in estimation:
         stated["control_period"] = estimation.pop("control_period")
     timing = with_usual_period({"dt": 0.002, **stated}, stated, sections["plant"])
-    firmware = build_firmware(estimation, rig, timing, given.seed)
+    only = next(iter(controllers.values())) if all(isinstance(one, Digital) for one in controllers.values()) else None
+    firmware = build_firmware(estimation, rig, timing, given.seed, only)
     period = timing.get("control_period", timing["dt"])
     settings = RobustnessConfig(seed=given.seed, control_period=period, **{**chosen, "dt": timing["dt"]})
     notes = [*notes_on(sections["plant"], plant, controllers), *firmware.notes]
@@ -115,7 +117,7 @@ def run(given: argparse.Namespace) -> int:
 def run_robustness(
     out: Path,
     rig: Rig | CartPole,
-    controllers: Mapping[str, Hybrid],
+    controllers: Mapping[str, Controller],
     settings: RobustnessConfig,
     notes: Sequence[str] = (),
     firmware: Firmware = BARE,

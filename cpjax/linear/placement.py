@@ -13,6 +13,7 @@ is a linear equation for dK, smooth through repeated poles as well. Its solution
 sensitivities, which are again sums in which digits cancel and are computed in double-word arithmetic.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Complex, Float, Num, Real
+from jaxtyping import Array, Complex, Float, Inexact, Num, Real
 
 from cpjax.errors import InputError
 from cpjax.linear.arguments import MatrixLike, column, columns, matrices, shaped, square
@@ -125,11 +126,7 @@ def polynomial_from_poles(poles: Num[ArrayLike, " n"] | Sequence[complex]) -> Fl
     poles = poles.astype(kind if jnp.issubdtype(kind, jnp.inexact) else jnp.result_type(float))
     if poles.ndim != 1 or poles.shape[0] == 0:
         raise InputError("poles", f"array of shape {poles.shape}", "of shape (n,); batches go through jax.vmap")
-    whole = jnp.ones((1,), dtype=poles.dtype)
-    bound = jnp.ones((1,), dtype=poles.real.dtype)
-    for i in range(poles.shape[0]):
-        whole = jnp.append(whole, 0.0) - poles[i] * jnp.append(jnp.zeros((1,), dtype=whole.dtype), whole)
-        bound = jnp.append(bound, 0.0) + jnp.abs(poles[i]) * jnp.append(jnp.zeros((1,), dtype=bound.dtype), bound)
+    whole, bound = _expanded(poles)
     if jnp.iscomplexobj(whole):
         paired = jnp.all(jnp.abs(whole.imag) <= 1e-6 * bound)
         if not is_traced(paired) and not paired:
@@ -138,6 +135,17 @@ def polynomial_from_poles(poles: Num[ArrayLike, " n"] | Sequence[complex]) -> Fl
     if not is_traced(whole) and not np.all(np.isfinite(whole)):
         raise InputError("poles", poles, "finite numbers")
     return whole[1:]
+
+
+@functools.partial(jax.jit, inline=True)  # one program in place of a compilation for each operation
+def _expanded(poles: Inexact[Array, " n"]) -> tuple[Inexact[Array, " m"], Float[Array, " m"]]:
+    """Returns the monic polynomial with these roots, and that with the negatives of their magnitudes as roots."""
+    whole = jnp.ones((1,), dtype=poles.dtype)
+    bound = jnp.ones((1,), dtype=poles.real.dtype)
+    for i in range(poles.shape[0]):
+        whole = jnp.append(whole, 0.0) - poles[i] * jnp.append(jnp.zeros((1,), dtype=whole.dtype), whole)
+        bound = jnp.append(bound, 0.0) + jnp.abs(poles[i]) * jnp.append(jnp.zeros((1,), dtype=bound.dtype), bound)
+    return whole, bound
 
 
 class QuadraticFactors(NamedTuple):

@@ -170,8 +170,18 @@ class CartPole:
           geometry: sine and cosine of theta.
           v: (x', theta') [m/s, rad/s].
         """
+        return self.solved(*geometry, *self.loads(geometry, v, u))
+
+    def loads(self, geometry: Pair, v: Pair, u: Scalars) -> Pair:
+        """Returns the right-hand sides of the equations of motion, as `solved` takes them [N, N m].
+
+        Args:
+          geometry: sine and cosine of theta.
+          v: (x', theta') [m/s, rad/s].
+          u: the applied voltage [V].
+        """
         force = real("plant.motor.force", call("plant.motor", self.motor, "force", u, v[0]))
-        return self.acceleration(*geometry, v, force)
+        return self._loads(geometry[0], v, force)
 
     def outputs(self, state: State, acceleration: Pair, u: Scalars) -> dict[str, Scalars]:
         """Returns what a trajectory saves beside state and voltage: x'' as `cart_acceleration` [m/s^2]."""
@@ -203,13 +213,17 @@ class CartPole:
           rates: `(x_dot, theta_dot)` [m/s, rad/s].
           force: horizontal force of the wheels on the cart [N]; of an `AccelerationActuator` the acceleration [m/s^2].
         """
+        return self.solved(sin, cos, *self._loads(sin, rates, force))
+
+    def _loads(self, sin: Scalars, rates: Pair, force: Scalars) -> Pair:
+        """Returns the right-hand sides of the equations of motion under a force of the wheels [N, N m]."""
         x_dot, theta_dot = rates
         ml = self.pole_mass * self.pole_length
         push = force - self.cart_friction * x_dot - ml * theta_dot * theta_dot * sin
         torque = ml * self.gravity * sin - self.pivot_friction * theta_dot
         if isinstance(self.motor, AccelerationActuator):  # decided while JAX traces
             push = force
-        return self.solved(sin, cos, push, torque)
+        return push, torque
 
     def solved(self, sin: Scalars, cos: Scalars, push: Scalars, torque: Scalars) -> tuple[Scalars, Scalars]:
         """Solves the equations of motion for `(x'', theta'')` [m/s^2, rad/s^2].

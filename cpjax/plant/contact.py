@@ -51,7 +51,7 @@ class ContactMode(NamedTuple):
 class InContact:
     """A `CartPole` with dry friction, stops or both, as the loop integrates it: a `cpjax.sim.plants.Eventful` plant."""
 
-    free: Any = part("a cpjax.CartPole, bare or on the bench", "accelerations", "solved")
+    free: Any = part("a cpjax.CartPole, bare or on the bench", "loads", "solved")
     half_length: Scalar | None = number(
         "m", "stops at this distance from the middle; None for no stops", default=None, above=0.0, optional=True
     )
@@ -105,14 +105,14 @@ class InContact:
 
     def accelerations(self, geometry: Pair, v: Pair, u: Scalar, mode: ContactMode) -> Pair:
         """Returns (x'', theta'') [m/s^2, rad/s^2] in the mode; exactly 0 for what is held."""
-        smooth, others = self._smooth_loads(geometry, v, u)
-        push, torque = self._with_friction(smooth, mode)
+        push, torque = self._with_friction(self.free.loads(geometry, v, u), mode)
         x_ddot, theta_ddot = self.free.solved(geometry[0], geometry[1], push, torque)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)
         x_ddot = jnp.where(resting, 0.0, jnp.where(held, alone_x, x_ddot))
         theta_ddot = jnp.where(held, 0.0, jnp.where(resting, alone_theta, theta_ddot))
-        return (x_ddot, theta_ddot, *others)
+        others: Any = v[2:]  # time, on the bench
+        return (x_ddot, theta_ddot, *(jnp.zeros_like(jnp.asarray(one)) for one in others))
 
     def start_mode(self, q: Pair, v: Pair) -> ContactMode:
         """Returns the mode at the start: what moves slides, what rests is held until the input is known."""
@@ -129,7 +129,7 @@ class InContact:
     def guards(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> tuple[Scalar, ...]:
         """Returns what ends a mode below zero: of the cart, of the pole, then the distances to the stops."""
         geometry = self.geometry(q)
-        cart, pole = self._holding(geometry, self._smooth_loads(geometry, v, u)[0], mode)
+        cart, pole = self._holding(geometry, self.free.loads(geometry, v, u), mode)
         static_x, static_theta = self._static()
         speed = None if self.free.coulomb_friction is None else v[0]
         return (
@@ -185,7 +185,7 @@ class InContact:
         Each is released in turn, with the other's state known: first the cart, then the pole, then the cart again.
         """
         geometry = self.geometry(q)
-        smooth, _ = self._smooth_loads(geometry, v, u)  # the same in every mode
+        smooth = self.free.loads(geometry, v, u)  # the same in every mode
         static_x, static_theta = self._static()
         for axis in ("cart", "pole", "cart"):
             cart, pole = self._holding(geometry, smooth, mode)
@@ -215,19 +215,9 @@ class InContact:
         """Returns whether the cart and whether the pole is at rest."""
         return (mode.cart == HELD) | (jnp.abs(mode.cart) == AT_STOP), mode.pole == HELD
 
-    def _smooth_loads(self, geometry: Pair, v: Pair, u: Scalar) -> tuple[_Loads, Any]:
-        """Returns force on the cart [N] and torque on the pole [N m] without dry friction, and the accelerations of
-        further coordinates."""
-        free = self.free
-        x_ddot, theta_ddot, *others = free.accelerations(geometry, v, u)  # whatever forces the plant has
-        coupling = self._coupling(geometry)
-        push = x_ddot if self._follows else (free.moving_mass + free.pole_mass) * x_ddot - coupling * theta_ddot
-        torque = free.pivot_inertia * theta_ddot - coupling * x_ddot
-        return (jnp.asarray(push), jnp.asarray(torque)), others
-
-    def _with_friction(self, smooth: _Loads, mode: ContactMode) -> _Loads:
+    def _with_friction(self, smooth: Pair, mode: ContactMode) -> _Loads:
         """Returns force [N] and torque [N m] with the friction of what slides."""
-        push, torque = smooth
+        push, torque = (jnp.asarray(load) for load in smooth)
         if self.free.coulomb_friction is not None:
             direction = jnp.where(jnp.abs(mode.cart) == 1, mode.cart, 0).astype(push.dtype)
             push = push - direction * self.free.coulomb_friction
@@ -247,10 +237,11 @@ class InContact:
     def _one_at_rest(self, push: Scalar, torque: Scalar) -> Pair:
         """Returns x'' with the pole at rest, and theta'' with the cart at rest."""
         free = self.free
-        alone = push if self._follows else push / (free.moving_mass + free.pole_mass)
-        return alone, torque / free.pivot_inertia
+        # Products with inverses that stay the same for a whole run: a division takes as long as six multiplications.
+        alone = push if self._follows else push * (1.0 / (free.moving_mass + free.pole_mass))
+        return alone, torque * (1.0 / free.pivot_inertia)
 
-    def _holding(self, geometry: Pair, smooth: _Loads, mode: ContactMode) -> Pair:
+    def _holding(self, geometry: Pair, smooth: Pair, mode: ContactMode) -> Pair:
         """Returns the force [N] and the torque [N m] that would move cart and pole from rest, their friction apart."""
         push, torque = self._with_friction(smooth, mode)
         coupling = self._coupling(geometry)

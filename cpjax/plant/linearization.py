@@ -1,5 +1,6 @@
 """Linear model of the plant about an equilibrium."""
 
+import functools
 from typing import Literal, NamedTuple
 
 import jax
@@ -46,14 +47,10 @@ def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | Stat
     if not isinstance(equilibrium, State):
         raise InputError("equilibrium", equilibrium, "upright, hanging or a State")
 
-    def field(vector: jax.Array, voltage: jax.Array) -> jax.Array:
-        return plant.vector_field(State.from_vector(vector), voltage).vector()
-
     dtype = jnp.result_type(float, *(leaf for leaf in jax.tree.leaves(plant) if hasattr(leaf, "dtype")))
     vector = jnp.asarray(equilibrium.vector(), dtype=dtype)
     voltage = jnp.zeros((), dtype=dtype)
-    A, B = jax.jacfwd(field, argnums=(0, 1))(vector, voltage)
-    drift = field(vector, voltage)
+    A, B, drift = _derivatives(plant, vector, voltage)
     if not is_traced(A) and not is_traced(drift):
         if np.all(np.isfinite(vector)) and not (np.all(np.isfinite(A)) and np.all(np.isfinite(B))):
             raise InputError("plant", plant, "one with a finite linear model; no gain can be computed for this one")
@@ -61,3 +58,16 @@ def linearize(plant: CartPole, equilibrium: Literal["upright", "hanging"] | Stat
         if not np.max(np.abs(drift)) <= 1e-6 * np.max(np.abs(A)):  # refuses NaN too
             raise InputError("equilibrium", equilibrium, "a state at rest in which nothing accelerates")
     return LinearModel(A, B[:, None])
+
+
+@functools.partial(jax.jit, inline=True)  # one program in place of a compilation for each operation
+def _derivatives(
+    plant: CartPole, vector: Float[Array, "4"], voltage: Float[Array, ""]
+) -> tuple[Float[Array, "4 4"], Float[Array, "4"], Float[Array, "4"]]:
+    """Returns the derivatives of the vector field with respect to state and voltage, and its value."""
+
+    def field(vector: Float[Array, "4"], voltage: Float[Array, ""]) -> Float[Array, "4"]:
+        return plant.vector_field(State.from_vector(vector), voltage).vector()
+
+    A, B = jax.jacfwd(field, argnums=(0, 1))(vector, voltage)
+    return A, B, field(vector, voltage)

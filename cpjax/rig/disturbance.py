@@ -152,7 +152,7 @@ class Disturbance:
         return Forces(sum(f.cart for f in found), sum(f.pole for f in found))
 
 
-def loads(plant: Any, tilt: Scalar, geometry: tuple[Scalar, Scalar], forces: Forces) -> tuple[Scalar, Scalar]:
+def added_loads(plant: Any, tilt: Scalar, geometry: tuple[Scalar, Scalar], forces: Forces) -> tuple[Scalar, Scalar]:
     """Returns what a tilted rail and forces add to the right-hand sides of a cart-pole: force [N], torque [N m].
 
     With the rail falling towards positive x by the angle a, gravity has the parts g sin(a) along the rail and g cos(a)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cpjax.plant import CartPole, State
 from cpjax.pytree import Scalar, part, pytree
-from cpjax.rig.disturbance import Disturbance, Forces, loads
+from cpjax.rig.disturbance import Disturbance, Forces, added_loads
 from cpjax.rig.drive import Drive, line_of_decay
 from cpjax.rig.track import Track
 
@@ -42,7 +42,7 @@ class Line(NamedTuple):
 class OnTheBench:
     """A cart-pole with its drive, track and disturbance, for the loop."""
 
-    plant: CartPole = part("a cpjax.CartPole", "accelerations", "saturate", "solved")
+    plant: CartPole = part("a cpjax.CartPole", "loads", "saturate", "solved")
     drive: Drive = part("a cpjax.Drive", "apply")
     track: Track | None = None
     disturbance: Disturbance | None = None
@@ -73,20 +73,24 @@ class OnTheBench:
 
     def accelerations(self, geometry: Coordinates, v: Coordinates, u: Scalar) -> Coordinates:
         """Returns x'' and theta'' [m/s^2, rad/s^2] under an applied voltage [V]."""
+        return self.plant.solved(geometry[0], geometry[1], *self.loads(geometry, v, u))
+
+    def loads(self, geometry: Coordinates, v: Coordinates, u: Scalar) -> Coordinates:
+        """Returns the right-hand sides of the equations of motion under an applied voltage [V], as `CartPole.loads`."""
         return self._under(u, geometry, v, None)
 
     def _under(self, voltage: Scalar, geometry: Coordinates, v: Coordinates, forces: Forces | None) -> Coordinates:
-        """Returns x'' and theta'' [m/s^2, rad/s^2] under a voltage that the supply does not hold, and forces."""
+        """Returns the loads under a voltage that the supply does not hold, and forces [N, N m]."""
         angle, rates = (geometry[0], geometry[1]), (v[0], v[1])
         if self.drive.source_resistance is not None:
             voltage = self._sagged(voltage, rates[0])
-        x_ddot, theta_ddot = self.plant.accelerations(angle, rates, voltage)
+        push, torque = self.plant.loads(angle, rates, voltage)
         if self.disturbance is None:
-            return x_ddot, theta_ddot
+            return push, torque
         zero = jnp.zeros_like(jnp.asarray(rates[0]))
         forces = Forces(zero, zero) if forces is None else forces
-        more = self.plant.solved(*angle, *loads(self.plant, self.disturbance.tilt, angle, forces))
-        return x_ddot + more[0], theta_ddot + more[1]
+        more = added_loads(self.plant, self.disturbance.tilt, angle, forces)
+        return push + more[0], torque + more[1]
 
     def outputs(self, state: State, acceleration: Coordinates, u: Scalar) -> dict[str, Scalar]:
         return self.plant.outputs(state, (acceleration[0], acceleration[1]), u)
@@ -148,11 +152,14 @@ class ChangingBench(OnTheBench):
 
     def accelerations(self, geometry: Coordinates, v: Coordinates, u: Scalar) -> Coordinates:
         """Returns x'' and theta'' [m/s^2, rad/s^2], and 0 for time, if that is a coordinate."""
+        return (*super().accelerations(geometry, v, u), *(jnp.zeros_like(jnp.asarray(one)) for one in v[2:]))
+
+    def loads(self, geometry: Coordinates, v: Coordinates, u: Scalar) -> Coordinates:
+        """Returns the right-hand sides of the equations of motion in the present step, as `CartPole.loads`."""
         voltage = u if self.line is None else self.line.value + self.line.slope * geometry[2]
         if self.inductance is not None:  # the motor's force at this voltage is that of the current
             voltage = voltage + self._back_emf(v[0])
-        found = self._under(voltage, geometry, v, self.forces)
-        return (*found, *(jnp.zeros_like(jnp.asarray(one)) for one in v[2:]))
+        return self._under(voltage, geometry, v, self.forces)
 
     def start_drive(self, state: State) -> DriveMemory:
         """Returns the drive's memory before the first step: no voltage, and no torque of a current that rises."""

@@ -31,7 +31,7 @@ from cpjax import (
     paper,
     rollout,
 )
-from cpjax.cli import animate, basin, compare, sweep
+from cpjax.cli import animate, basin, compare, robustness, sweep
 from cpjax.cli.notes import papers_own
 from cpjax.cli.rig_file import rig_text
 from cpjax.cli.rigs import Firmware, build_firmware, build_rig, load_rig, with_usual_period
@@ -234,11 +234,14 @@ def test_the_estimator_is_chosen_and_an_unfit_one_is_refused():
     setting = {"dt": 0.002}
     raised = build_firmware({}, FULL, setting, 5)
     assert isinstance(raised, Firmware)
-    assert (raised.dead_band, raised.simulation) == (0.6, {"seed": 5})
+    assert (raised.dead_band, raised.delay, raised.simulation) == (0.6, 5, {"seed": 5})
+    assert "predicts them over 5 periods, the drive's delay of 0.01 s" in raised.notes[0]
     deviations = {"x_deviation": math.sqrt(1e-8 / 12 + 1e-8), "theta_deviation": 2e-3 / math.sqrt(12.0)}
     designed = kalman_observer(FULL.plant, period=0.002, **deviations)
     np.testing.assert_allclose(raised.estimator.gain, designed.gain, rtol=1e-9)
-    assert float(build_firmware({"estimator": "derivative"}, FULL, setting, 1).estimator.cutoff) == 300.0
+    differences = build_firmware({"estimator": "derivative"}, FULL, setting, 1)
+    assert (float(differences.estimator.cutoff), differences.delay) == (300.0, 0)
+    assert "the drive's delay of 0.01 s is not predicted" in differences.notes[0]
     law = object()
     assert build_firmware({"estimator": "none"}, FULL, setting, 1)(law) is law
     assert "nothing raises them" in build_firmware({"estimator": "none"}, FULL, setting, 1).notes[0]
@@ -257,6 +260,23 @@ def test_the_estimator_is_chosen_and_an_unfit_one_is_refused():
         assert caught.value.field == field
     with pytest.raises(InputError, match="estimator of its own"):
         build_firmware({"estimator": "kalman"}, FULL, setting, 1, firmware)
+
+
+def test_a_robustness_card_is_that_of_firmware_from_a_file(command, tmp_path, monkeypatch):
+    firmware = Digital(paper.controller("corrected", "lqr", paper.appendix_plant()), FilteredDerivative(90.0), delay=0)
+    io.save(tmp_path / "firmware.toml", firmware)
+    io.save(tmp_path / "mine.toml", FULL)
+    seen = []
+
+    def card(rig, controller, *_, **__):
+        seen.append((io.encode(rig), io.encode(controller)))
+        raise InputError("rig", "seen", "no more")
+
+    monkeypatch.setattr(robustness, "robustness_card", card)
+    given = ("--rig", tmp_path / "mine.toml", "--controllers", tmp_path / "firmware.toml", "--out", tmp_path / "out")
+    assert command("robustness", *given).code == 2
+    assert seen == [(io.encode(FULL), io.encode(firmware))]
+    assert "absent: the controller is a Digital" in command("robustness", *given, "--estimator", "kalman").err
 
 
 def test_a_rig_by_name_has_its_usual_control_period_unless_another_is_given():
