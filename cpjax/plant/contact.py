@@ -18,6 +18,7 @@ two events fell into one step: so neither adds energy.
 import dataclasses
 from typing import Any, NamedTuple, TypeAlias
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -111,8 +112,8 @@ class InContact:
         alone_x, alone_theta = self._one_at_rest(push, torque)
         x_ddot = jnp.where(resting, 0.0, jnp.where(held, alone_x, x_ddot))
         theta_ddot = jnp.where(held, 0.0, jnp.where(resting, alone_theta, theta_ddot))
-        others: Any = v[2:]  # time, on the bench
-        return (x_ddot, theta_ddot, *(jnp.zeros_like(jnp.asarray(one)) for one in others))
+        others: Any = jax.tree.map(jnp.zeros_like, v[2:])  # of time, on the bench
+        return (x_ddot, theta_ddot, *others)
 
     def start_mode(self, q: Pair, v: Pair) -> ContactMode:
         """Returns the mode at the start: what moves slides, what rests is held until the input is known."""
