@@ -475,7 +475,13 @@ def test_everything_public_is_called_with_its_types_checked():
     assert sorted(calls()) == sorted(public_things())
 
 
-@pytest.mark.parametrize("part", [*PACKAGES, "runs", "refusals"])
+SLOW = ("linear", "controllers", "runs")
+
+
+@pytest.mark.parametrize(
+    "part",
+    [pytest.param(one, marks=[pytest.mark.slow] * (one in SLOW)) for one in (*PACKAGES, "runs", "refusals")],
+)
 def test_types_state_the_shapes_that_calls_have(part):
     faster = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     command = [sys.executable, __file__, part]

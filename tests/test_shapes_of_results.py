@@ -291,7 +291,7 @@ def of_values_that_do_not_fit():
 
 
 CHECKS = {name for name in globals() if name.startswith("of_")}
-SLOW = {"of_a_design", "of_a_tuning", "of_an_audit", "of_fronts"}
+SLOW = {"of_a_design", "of_a_rollout", "of_a_tuning", "of_an_audit", "of_fronts", "of_values_that_do_not_fit"}
 
 
 @functools.cache

@@ -178,6 +178,7 @@ def test_a_check_says_in_words_what_a_rig_leaves_out(command, tmp_path, monkeypa
     assert "the drive is a force" in force["warnings"][0]
 
 
+@pytest.mark.slow
 def test_a_swing_up_that_the_search_finds_is_one_by_another_integrator_too():
     possible, impossible = (dataclasses.replace(FULL, track=Track(length)) for length in (0.5, 0.003))
     found, none = search_swing_up(possible, seed=3), search_swing_up(impossible, seed=3)
@@ -335,6 +336,7 @@ def test_a_command_that_would_ignore_parts_of_a_rig_refuses_it(command, tmp_path
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_front_counts_no_run_that_leaves_the_rigs_track(monkeypatch):
     monkeypatch.setattr(evaluator, "_RUNS", 4)
     monkeypatch.setattr(evaluator, "_CONTROLLERS", 1)

@@ -203,7 +203,7 @@ def test_derivatives_through_stick_and_slip_are_those_of_differences(clock):
         assert float(gradient[i] * p[i]) == pytest.approx(float(found), **tolerance)
 
 
-@pytest.mark.parametrize("switching", ["per_step", "located"])
+@pytest.mark.parametrize("switching", ["per_step", pytest.param("located", marks=pytest.mark.slow)])
 def test_neither_friction_nor_stops_add_energy(switching):
     plant = dataclasses.replace(DRY, coulomb_friction=1.0, motor=ForceActuator())
     rng, n = np.random.default_rng(0), 60
@@ -219,6 +219,7 @@ def test_neither_friction_nor_stops_add_energy(switching):
     assert np.min(energy[:, 0] - energy[:, -1]) > 0.1
 
 
+@pytest.mark.slow
 def test_a_pole_that_a_stop_turns_round_slides_the_other_way():
     rig = Rig(DRY, track=Track(half_length=0.2, ends="stop", restitution=1.0))
     start = State(0.199, 2.0, 0.1, 0.5)  # the impact gives the pole about -5 rad/s
@@ -237,6 +238,7 @@ def test_a_cart_does_not_start_beyond_a_stop():
         cpjax.rollout(rig, LAW, State(0.21, 0.0, 3.0, 0.0), duration=0.02, dt=2e-3)
 
 
+@pytest.mark.slow
 def test_each_run_of_a_sweep_may_have_a_track_of_its_own():
     lengths = np.array([0.1, 0.2, 0.3])
     rig = Rig(PLANT, track=Track(half_length=lengths, ends="stop"))

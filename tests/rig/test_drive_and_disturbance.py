@@ -74,7 +74,7 @@ def test_tilt_and_pushes_are_those_of_the_equations_of_motion():
     assert float(run.cart_acceleration[35]) == pytest.approx(a[0], abs=1e-6)
 
 
-@pytest.mark.parametrize("lag", [0.02, 1e-3, 1e-5])
+@pytest.mark.parametrize("lag", [1e-3, *(pytest.param(one, marks=pytest.mark.slow) for one in (0.02, 1e-5))])
 def test_a_lag_of_any_length_needs_no_shorter_step(lag):
     rig = Rig(PLANT, drive=Drive(lag=lag))
     run = cpjax.rollout(rig, SIGNAL, START, duration=0.6, dt=2e-3, control_period=0.05 - 0.0, save_every=25)

@@ -171,7 +171,7 @@ def test_a_rig_by_name_comes_back_from_a_file(name, tmp_path):
     assert PRESETS[name].source
 
 
-@pytest.mark.parametrize("period", [0.001, 0.005, 0.02])
+@pytest.mark.parametrize("period", [0.005, *(pytest.param(one, marks=pytest.mark.slow) for one in (0.001, 0.02))])
 def test_an_observer_halves_the_filtered_derivatives_velocity_error(period):
     sensors = Encoders(x_step=2e-4, theta_step=2 * math.pi / 2000)
     observer = cpjax.kalman_observer(

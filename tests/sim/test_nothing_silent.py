@@ -31,6 +31,7 @@ def assert_equal(found, expected, rtol=1e-12):
         np.testing.assert_allclose(a, b, rtol=rtol)
 
 
+@pytest.mark.slow
 def test_a_traced_sweep_of_runaways_has_their_flags_metrics_and_gradients():
     settings = {"duration": 4.0, "dt": 2e-3}
     mapped = jax.vmap(lambda start: cpjax.measure(UNLIMITED, WILD, start, **settings))(RUNAWAYS)

@@ -69,6 +69,7 @@ def test_scores_are_means_with_wilsons_intervals(card):
     assert card.together.trials == 10
 
 
+@pytest.mark.slow
 def test_delays_that_differ_between_runs_are_those_of_single_sweeps():
     starts = cpjax.sample_starts("hanging", 4, seed=2)
     settings = {"duration": 1.0, "dt": 0.002, "control_period": 0.006}
