@@ -9,6 +9,7 @@ dual equation may be so large that doubling lost all digits, or an unstable mode
 case doubling without that weight finds a solution that does not stabilise.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
@@ -35,14 +36,13 @@ from cpjax.numeric.small_matrices import (
     symmetric,
     transpose,
 )
+from cpjax.pytree import is_traced
 
 _MOST_DOUBLINGS = 60
 _MOST_CORRECTIONS = 12
 
 
-@batch_last
-@jax.jit
-def solve_continuous(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix]:
+def _continuous(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix, *, attempts: int = 2) -> tuple[Matrix, Matrix]:
     """Returns P and K of the continuous-time equation, matrix axes first; NaN where there are none."""
     a, b, q, r, cross = (double_word(x) for x in (A, B, Q, R, transpose(N)))
 
@@ -57,12 +57,10 @@ def solve_continuous(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> t
         rest = dw.add(dw.add(PA, transpose(PA)), rest)
         return sum_continuous(A - product(B, K.high), symmetric(rest.high))
 
-    return _found(_cayley(A, B, Q, R, N), correction, gain, _weights_are_valid(Q, R, N))
+    return _found(_cayley(A, B, Q, R, N), correction, gain, _weights_are_valid(Q, R, N), attempts)
 
 
-@batch_last
-@jax.jit
-def solve_discrete(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix]:
+def _discrete(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix, *, attempts: int = 2) -> tuple[Matrix, Matrix]:
     """Returns P and K of the discrete-time equation, matrix axes first; NaN where there are none."""
     a, b, q, r, cross = (double_word(x) for x in (A, B, Q, R, transpose(N)))
 
@@ -80,7 +78,7 @@ def solve_discrete(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tup
     A0, G, H = _without_cross_term(A, B, Q, R, N)
     scale = _balance(G, H)
     doubled = _Doubled(A0, G * scale, H / scale, scale)
-    return _found(doubled, correction, gain, _weights_are_valid(Q, R, N))
+    return _found(doubled, correction, gain, _weights_are_valid(Q, R, N), attempts)
 
 
 class _Doubled(NamedTuple):
@@ -118,9 +116,12 @@ def _found(
     correction: Callable[[DoubleWord], Sum],
     gain: Callable[[DoubleWord], tuple[DoubleWord, DoubleWord]],
     valid: jax.Array,
+    attempts: int,
 ) -> tuple[Matrix, Matrix]:
     """Returns P and K, NaN where there are none. The second attempt is made only if a batch element needs it."""
     P, K = _corrected(_double(problem, _PLAIN), correction, gain, valid)
+    if attempts == 1:
+        return P, K
     finite = jnp.all(jnp.isfinite(problem.E + problem.G + problem.H), axis=(0, 1))
     missed = valid & finite & ~jnp.all(jnp.isfinite(P), axis=(0, 1))
 
@@ -306,3 +307,27 @@ def _weights_are_valid(Q: Matrix, R: Matrix, N: Matrix) -> jax.Array:
     size = jnp.where(size > 0.0, size, 1.0)
     room = 16.0 * H.shape[0] * np.finfo(H.dtype).eps * identity_like(H)
     return is_positive_definite(R) & is_positive_definite(H / (size[:, None] * size[None]) + room)
+
+
+def _solver(solve: Callable[..., tuple[Matrix, Matrix]]) -> Callable[..., tuple[Matrix, Matrix]]:
+    """Returns the compiled solver of an equation.
+
+    For known matrices the first attempt, which nearly always suffices, is a program of its own: it takes less than half
+    the time to compile.
+    """
+    first = jax.jit(functools.partial(solve, attempts=1))
+    both = batch_last(jax.jit(solve))
+
+    @functools.wraps(solve)
+    def solved(*problem: Matrix) -> tuple[Matrix, Matrix]:
+        if not any(is_traced(matrix) for matrix in problem):
+            P, K = first(*problem)
+            if np.all(np.isfinite(P)):
+                return P, K
+        return both(*problem)
+
+    return solved
+
+
+solve_continuous = _solver(_continuous)
+solve_discrete = _solver(_discrete)
