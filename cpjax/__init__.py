@@ -6,7 +6,7 @@ JAX's settings.
 """
 
 # First, and for its effect alone: an interrupt during the imports below, which take a second, then ends quietly.
-from cpjax import startup as _startup  # noqa: F401  # nothing here uses the name
+from cpjax import startup as startup
 
 # isort: split
 import importlib

@@ -1,4 +1,4 @@
-"""What it costs to begin: import times, the first swing-up on the command line, memory of a large sweep.
+"""Time to begin: imports, the first swing-up on the command line, first designs and gradients, memory of a large sweep.
 
     python experiments/start_up.py
 
@@ -21,6 +21,35 @@ from _common import run
 from cpjax import files
 
 IMPORT = "import time; t = time.perf_counter(); import {}; print(time.perf_counter() - t)"
+CALLS = """
+import dataclasses, json, time, jax
+jax.config.update("jax_enable_x64", True)
+import cpjax
+
+plant, law, start = cpjax.CartPole(), cpjax.preset("lqr"), cpjax.State(0.0, 0.0, 3.1, 0.0)
+seconds = {{}}
+
+
+def timed(name, call):
+    begin = time.perf_counter()
+    result = jax.block_until_ready(call())
+    seconds[name] = time.perf_counter() - begin
+    return result
+
+
+def cost(mass):
+    settings = dict(duration={duration}, dt=0.002, clock="continuous", switching="located")
+    moved = dataclasses.replace(plant, cart_mass=mass)
+    return cpjax.measure(moved, law, start, metrics=cpjax.TimeOutside(), **settings)
+
+
+A, B = timed("linearize", lambda: cpjax.linearize(plant))
+timed("linearize again", lambda: cpjax.linearize(plant))
+timed("lqr", lambda: cpjax.lqr(A, B, jax.numpy.eye(4), 1.0))
+timed("dlqr", lambda: cpjax.dlqr(0.1 * A, B, jax.numpy.eye(4), 1.0))
+timed("gradient through located switches", lambda: jax.grad(cost)(1.0))
+print(json.dumps(seconds))
+"""
 SWEEP = """
 import json, resource, time, jax
 jax.config.update("jax_enable_x64", True)
@@ -52,7 +81,7 @@ print(json.dumps(dict(**times, peak_MiB=peak_mebibytes(), success=float(metrics.
 
 
 def python(code: str) -> str:
-    """What a fresh interpreter prints."""
+    """Returns what a fresh interpreter prints."""
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
 
 
@@ -74,11 +103,13 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
     count, duration = (64, 1.0) if quick else (4096, 10.0)
     measured = json.loads(python(SWEEP.format(count=count, seed=seed, duration=duration)))
     sweep = {"starts": count, "duration_s": duration, **measured}
+    calls = [json.loads(python(CALLS.format(duration=duration))) for _ in range(repeats)]
     result: dict[str, Any] = {
         "versions": files.versions(),
         "import_jax_s": statistics.median(imports["jax, jax.numpy"]),
         "import_cpjax_s": statistics.median(imports["cpjax"]),
         "first_swingup_s": {kept: statistics.median(found) for kept, found in first.items()},
+        "first_calls_s": {name: statistics.median(one[name] for one in calls) for name in calls[0]},
         "sweep": sweep,
     }
     files.write_json(out / "start_up.json", result)
@@ -86,6 +117,8 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> dict[str, Any]:
     print(f"import cpjax   {result['import_cpjax_s']:.2f} s, jax included")
     for kept, seconds in result["first_swingup_s"].items():
         print(f"cpjax swingup  {seconds:.2f} s, from the shell's prompt to the files, {kept} compilation cache")
+    for name, seconds in result["first_calls_s"].items():
+        print(f"{name:34s} {seconds:.4f} s in a fresh process, compilation included")
     print(
         f"{count} starts x {duration:g} s at 2 ms: {sweep['first_s']:.2f} s with compilation, "
         f"{sweep['second_s']:.2f} s without, peak memory of the process {sweep['peak_MiB']:.0f} MiB"

@@ -43,7 +43,7 @@ def add_command(commands: Any) -> None:
 
     text = (
         "Says what moves and how fast, how finely it is measured, what the linear model asks of the control period, "
-        "whether track and supply allow a swing-up, and what the rig does not say. Writes rig.json."
+        "whether track and supply allow a swing-up, and what its file leaves at ideal values. Writes rig.json."
     )
     checked = actions.add_parser(
         "check", help="what a rig can do, and what its file leaves at ideal values", description=text

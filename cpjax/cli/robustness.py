@@ -93,8 +93,8 @@ def run(given: argparse.Namespace) -> int:
     if "control_period" in estimation:
         stated["control_period"] = estimation.pop("control_period")
     timing = with_usual_period({"dt": 0.002, **stated}, stated, sections["plant"])
-    only = next(iter(controllers.values())) if all(isinstance(one, Digital) for one in controllers.values()) else None
-    firmware = build_firmware(estimation, rig, timing, given.seed, only)
+    bare = [one for one in controllers.values() if not isinstance(one, Digital)]
+    firmware = build_firmware(estimation, rig, timing, given.seed, (bare or [*controllers.values()])[0])
     period = timing.get("control_period", timing["dt"])
     settings = RobustnessConfig(seed=given.seed, control_period=period, **{**chosen, "dt": timing["dt"]})
     notes = [*notes_on(sections["plant"], plant, controllers), *firmware.notes]

@@ -58,8 +58,7 @@ class VoltageSignal:
 
     def update(self, memory: SignalMemory, measurement: object) -> tuple[SignalMemory, Scalar]:
         """Returns the new memory and the voltage of this instant [V]."""
-        # The times are only compared with the control instants, which do not move with them: a derivative would be 0.
-        times = lax.stop_gradient(jnp.asarray(self.times))
+        times = jnp.asarray(self.times)  # only compared, so that nothing has a derivative in them
         voltages = jnp.asarray(self.voltages)
         count = times.shape[0]
 

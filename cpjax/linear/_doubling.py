@@ -312,8 +312,8 @@ def _weights_are_valid(Q: Matrix, R: Matrix, N: Matrix) -> jax.Array:
 def _solver(solve: Callable[..., tuple[Matrix, Matrix]]) -> Callable[..., tuple[Matrix, Matrix]]:
     """Returns the compiled solver of an equation.
 
-    For known matrices the first attempt, which nearly always suffices, is a program of its own: it takes about half
-    the time to compile.
+    For known matrices the first attempt, which nearly always suffices, is a program of its own: the second is then not
+    compiled either.
     """
     first = jax.jit(functools.partial(solve, attempts=1))
     both = batch_last(jax.jit(solve))

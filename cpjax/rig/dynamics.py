@@ -9,6 +9,7 @@ of the step is a third coordinate, whose velocity is 1.
 import dataclasses
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -152,7 +153,7 @@ class ChangingBench(OnTheBench):
 
     def accelerations(self, geometry: Coordinates, v: Coordinates, u: Scalar) -> Coordinates:
         """Returns x'' and theta'' [m/s^2, rad/s^2], and 0 for time, if that is a coordinate."""
-        return (*super().accelerations(geometry, v, u), *(jnp.zeros_like(jnp.asarray(one)) for one in v[2:]))
+        return (*super().accelerations(geometry, v, u), *jax.tree.map(jnp.zeros_like, v[2:]))
 
     def loads(self, geometry: Coordinates, v: Coordinates, u: Scalar) -> Coordinates:
         """Returns the right-hand sides of the equations of motion in the present step, as `CartPole.loads`."""

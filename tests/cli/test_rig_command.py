@@ -264,7 +264,7 @@ def test_the_estimator_is_chosen_and_an_unfit_one_is_refused():
 
 
 def test_a_robustness_card_is_that_of_firmware_from_a_file(command, tmp_path, monkeypatch):
-    firmware = Digital(paper.controller("corrected", "lqr", paper.appendix_plant()), FilteredDerivative(90.0), delay=0)
+    firmware = Digital(paper.controller("corrected", "lqr", paper.appendix_plant()), FilteredDerivative(90.0))
     io.save(tmp_path / "firmware.toml", firmware)
     io.save(tmp_path / "mine.toml", FULL)
     seen = []
