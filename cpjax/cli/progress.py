@@ -30,8 +30,8 @@ def progress(what: str) -> Iterator[Report]:
         yield lambda done, total, text: bar.update(task, completed=done, total=total, description=printable(text))
 
 
-def compiling(report: Report, before: str) -> Report:
-    """Returns `report` with a notice of a compilation in the first text that begins with `before`.
+def compiling(report: Report, *before: str) -> Report:
+    """Returns `report` with a notice of a compilation in the first text that begins with one of `before`.
 
     The compilation reports no progress. That of a gradient takes a minute or more, unless an earlier process cached it.
     """

@@ -109,7 +109,7 @@ def run_tuning(
 
     plant = plant_of(rig)
     with progress("tune") as report:
-        tuning = tune(plant, free, plan, progress=compiling(report, "loss"), checkpoint=checkpoint)
+        tuning = tune(plant, free, plan, progress=compiling(report, "screened", "loss"), checkpoint=checkpoint)
     io.save(out / "tuned.json", tuning.controller)
     files.write_json(out / "tune.json", {**document(tuning, plant, free, plan), **io.encode_bench(rig), "notes": notes})
 

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from cpjax.plant.cartpole import Pair
@@ -32,6 +33,9 @@ HELD, AT_STOP = 0, 2
 
 _SLOWEST_REBOUND = 1e-3
 """Rebounds of the cart below this speed [m/s] end at rest: with restitution, infinitely many follow one another."""
+
+_LOOSE = 3
+"""Mode between `jump` and `release` of what no longer holds: `release`, which knows the input, finds the direction."""
 
 _NO_END = 1.0
 """Guard of a mode that ends otherwise."""
@@ -128,43 +132,43 @@ class InContact:
         return ContactMode(cart, pole)
 
     def guards(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> tuple[Scalar, ...]:
-        """Returns what ends a mode below zero: of the cart, of the pole, then the distances to the stops."""
+        """Returns what ends a mode below zero: of the cart, of the pole, then the distance to the nearer stop.
+
+        Each is smooth where it is about zero. With one guard for two directions there are fewer to compare.
+        """
         geometry = self.geometry(q)
         cart, pole = self._holding(geometry, self.free.loads(geometry, v, u), mode)
         static_x, static_theta = self._static()
         speed = None if self.free.coulomb_friction is None else v[0]
         return (
-            *_ends(mode.cart, speed, cart, static_x),
-            *(() if self.free.pivot_coulomb_friction is None else _ends(mode.pole, v[1], pole, static_theta)),
-            *self._stops(q, mode),
+            _end(mode.cart, speed, cart, static_x),
+            *(() if self.free.pivot_coulomb_friction is None else (_end(mode.pole, v[1], pole, static_theta),)),
+            *self._stop(q, mode),
         )
 
     def jump(self, q: Pair, v: Pair, mode: ContactMode, guard: Int[Array, ""]) -> tuple[Pair, Pair, ContactMode]:
-        """Returns positions, velocities and mode after a guard has fallen."""
+        """Returns positions, velocities and mode after a guard has fallen; what no longer holds is `_LOOSE`."""
         cart, pole = mode
         x, x_dot = q[0], v[0]
         theta_dot = v[1]
         sliding = jnp.abs(cart) == 1
         coupling = self._coupling(self.geometry(q))
-        # Guards 0 and 1: a sliding cart has come to rest; a held one is pushed to the right (0) or to the left (1).
-        of_cart = (guard == 0) | (guard == 1)
-        away = jnp.where(guard == 0, 1, -1)
+        of_cart = guard == 0
         x_dot = jnp.where(of_cart & sliding, 0.0, x_dot)
-        leaving = jnp.where(cart == HELD, away, -jnp.sign(cart))  # from a stop, away from it
-        after = jnp.where(of_cart, jnp.where(sliding, HELD, leaving), cart)
-        number = 2
+        after = jnp.where(of_cart, jnp.where(sliding, HELD, _LOOSE), cart)
+        number = 1
         if self.free.pivot_coulomb_friction is not None:
-            of_pole = (guard == 2) | (guard == 3)
+            of_pole = guard == 1
             turning = jnp.abs(pole) == 1
             if not self._follows:
                 moved = -coupling * theta_dot / (self.free.moving_mass + self.free.pole_mass)
                 x_dot = x_dot + jnp.where(of_pole & turning & sliding, moved, 0.0)
             theta_dot = jnp.where(of_pole & turning, 0.0, theta_dot)
-            pole = jnp.where(of_pole, jnp.where(turning, HELD, jnp.where(guard == 2, 1, -1)), pole)
-            number = 4
-        hits = guard >= number
+            pole = jnp.where(of_pole, jnp.where(turning, HELD, _LOOSE), pole)
+            number = 2
+        hits = guard == number
         if self.half_length is not None:
-            side = jnp.where(guard == number, 1, -1)
+            side = jnp.where(x > 0.0, 1, -1)
             # Another event in the same step may have turned the cart already.
             back = jnp.where(side * x_dot > 0.0, -self.restitution * x_dot, x_dot)
             rebounds = jnp.abs(back) >= _SLOWEST_REBOUND
@@ -181,22 +185,26 @@ class InContact:
         return (x, *q[1:]), (x_dot, theta_dot, *v[2:]), ContactMode(after.astype(cart.dtype), pole.astype(cart.dtype))
 
     def release(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> ContactMode:
-        """Returns the mode that the input imposes at once: what is held slides where the static friction is exceeded.
+        """Returns the mode that the input imposes at once: what is held slides where the static friction is exceeded,
+        and what is loose slides as it is pushed.
 
         Each is released in turn, with the other's state known: first the cart, then the pole, then the cart again.
         """
         geometry = self.geometry(q)
         smooth = self.free.loads(geometry, v, u)  # the same in every mode
         static_x, static_theta = self._static()
+        loose = mode.pole == _LOOSE
+        _, pole = self._holding(geometry, smooth, mode._replace(pole=jnp.where(loose, HELD, mode.pole)))
+        mode = mode._replace(pole=jnp.where(loose, _direction(pole), mode.pole))
         for axis in ("cart", "pole", "cart"):
             cart, pole = self._holding(geometry, smooth, mode)
             if axis == "pole":
                 loose = (mode.pole == HELD) & (jnp.abs(pole) > static_theta)
-                mode = mode._replace(pole=jnp.where(loose, jnp.sign(pole).astype(mode.pole.dtype), mode.pole))
+                mode = mode._replace(pole=jnp.where(loose, _direction(pole), mode.pole))
                 continue
-            loose = (mode.cart == HELD) & (jnp.abs(cart) > static_x)
+            loose = (mode.cart == _LOOSE) | (mode.cart == HELD) & (jnp.abs(cart) > static_x)
             loose |= (mode.cart == AT_STOP) & (cart < -static_x) | (mode.cart == -AT_STOP) & (cart > static_x)
-            mode = mode._replace(cart=jnp.where(loose, jnp.sign(cart).astype(mode.cart.dtype), mode.cart))
+            mode = mode._replace(cart=jnp.where(loose, _direction(cart), mode.cart))
         return mode
 
     def during(
@@ -253,13 +261,11 @@ class InContact:
             torque + coupling * jnp.where(resting, 0.0, alone_x),
         )
 
-    def _stops(self, q: Pair, mode: ContactMode) -> tuple[Scalar, ...]:
-        """Returns the distances to the stops."""
+    def _stop(self, q: Pair, mode: ContactMode) -> tuple[Scalar, ...]:
+        """Returns the distance to the nearer stop."""
         if self.half_length is None:
             return ()
-        right = jnp.where(mode.cart == AT_STOP, _NO_END, self.half_length - q[0])
-        left = jnp.where(mode.cart == -AT_STOP, _NO_END, self.half_length + q[0])
-        return right, left
+        return (jnp.where(jnp.abs(mode.cart) == AT_STOP, _NO_END, self.half_length - jnp.abs(q[0])),)
 
 
 def in_contact(plant: Any, half_length: Scalar | None = None, restitution: Scalar = 0.0) -> Any:
@@ -275,17 +281,18 @@ def in_contact(plant: Any, half_length: Scalar | None = None, restitution: Scala
     return InContact(plant, half_length, restitution)
 
 
-def _ends(mode: Int[Array, ""], rate: Scalar | None, force: Scalar, static: Scalar) -> tuple[Scalar, Scalar]:
-    """Returns the two guards of one axis.
+def _end(mode: Int[Array, ""], rate: Scalar | None, force: Scalar, static: Scalar) -> Scalar:
+    """Returns the guard of one axis.
 
-    Sliding: the speed (None without dry friction), and none. Held: what is left of the static friction towards the
-    right, and towards the left.
-    At a stop: what is left of the force that presses the cart against it, static friction included, and none.
+    Sliding: the speed, or none without dry friction. Held: what is left of the static friction.
+    At a stop: what is left of the force that presses the cart against it, static friction included.
     """
-    sliding = jnp.abs(mode) == 1
-    stopped = jnp.abs(mode) == AT_STOP
     side = jnp.sign(mode).astype(jnp.asarray(force).dtype)
     speed = _NO_END if rate is None else side * rate
-    first = jnp.where(sliding, speed, jnp.where(stopped, side * force + static, static - force))
-    second = jnp.where(sliding | stopped, _NO_END, static + force)
-    return first, second
+    press = jnp.where(mode == HELD, -jnp.abs(force), side * force)
+    return jnp.where(jnp.abs(mode) == 1, speed, static + press)
+
+
+def _direction(force: Scalar) -> Int[Array, ""]:
+    """Returns the mode of what slides as a force pushes it."""
+    return jnp.where(force > 0.0, np.int32(1), np.int32(-1))

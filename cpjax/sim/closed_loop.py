@@ -1,7 +1,7 @@
 """Plant and controller as a `System` of smooth modes, in the form that located switching integrates.
 
-On the continuous clock the guards are the two voltage limits, the controller's margin and the plant's own guards; on
-the sampled clock, on which the input is held, only the plant's own.
+On the continuous clock the guards are the voltage limit, the controller's margin and the plant's own guards; on the
+sampled clock, on which the input is held, only the plant's own.
 """
 
 from typing import Any, NamedTuple, TypeAlias
@@ -18,8 +18,8 @@ from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.stepper import dtype_of
 from cpjax.sim.switching import Observation
 
-UPPER, LOWER, GATE = 0, 1, 2
-"""Indices of the guards on the continuous clock: the two voltage limits and the controller's margin."""
+LIMIT, GATE = 0, 1
+"""Indices of the guards on the continuous clock: the voltage limit, of either sign, and the controller's margin."""
 
 GATE_CROSSING = GATE + 1
 """Value of `Sample.crossing` at a located change of the controller's mode."""
@@ -53,10 +53,9 @@ class ContinuousLoop(NamedTuple):
         demanded = self._demand(state, mode.law)
         relative = demanded / limit  # 0 for an infinite supply
         margin = real("controller.margin", call("controller", self.controller, "margin", state, mode.law))
-        u = jnp.where(mode.clip == 0, demanded, jnp.where(mode.clip > 0, limit, -limit))
+        u = self._applied(demanded, mode.clip)
         guards = (
-            jnp.where(mode.clip > 0, relative - 1.0, 1.0 - relative),
-            jnp.where(mode.clip < 0, -1.0 - relative, 1.0 + relative),
+            jnp.where(mode.clip == 0, 1.0 - jnp.abs(relative), jnp.where(mode.clip > 0, relative, -relative) - 1.0),
             margin.astype(dtype_of(state)),
             *plant_guards(self.plant, q, v, u, mode.plant),
         )
@@ -70,33 +69,35 @@ class ContinuousLoop(NamedTuple):
             after = outline(plants.jump)(self.plant, q, v, mode.plant, guard - (GATE + 1))
             q, v, of_plant = jax.tree.map(lambda new, old: jnp.where(own, new, old), after, (q, v, mode.plant))
         state = plants.state_of(self.plant, q, v)
-        now = self._clip(state, law)
-        # On the limit itself the sign is rounding error and is ignored. A demand that has jumped past the other limit
-        # is clipped there.
+        demanded = self._demand(state, law)
+        now = self._clip(demanded)
+        # On the limit itself the demand's excess is rounding error and is ignored. A demand that has jumped past the
+        # other limit is clipped there.
         inside = jnp.where(now == -mode.clip, now, 0)
-        clip = jnp.where(mode.clip == 0, jnp.where(guard == UPPER, 1, -1), inside)
+        clip = jnp.where(mode.clip == 0, jnp.where(demanded > 0.0, 1, -1), inside)
         clip = jnp.where((guard == GATE) | own, now, clip).astype(mode.clip.dtype)
         # A jump of the plant's state may have moved the demand beyond a limit, and one of the demand may release it.
         if plants.has_events(self.plant):
-            of_plant = outline(plants.release)(self.plant, q, v, self._applied(state, law, clip), of_plant)
+            of_plant = outline(plants.release)(self.plant, q, v, self._applied(demanded, clip), of_plant)
         return q, v, Mode(law, clip, of_plant)
 
     def start_mode(self, start: Tree) -> Mode:
         """Returns the mode at the start of a rollout."""
         law = integer("controller.start_mode", call("controller", self.controller, "start_mode", start))
-        clip = self._clip(start, law)
+        demanded = self._demand(start, law)
+        clip = self._clip(demanded)
         q, v = plants.coordinates(self.plant, start)
         of_plant = plants.start_mode(self.plant, q, v)
-        return Mode(law, clip, plants.release(self.plant, q, v, self._applied(start, law, clip), of_plant))
+        return Mode(law, clip, plants.release(self.plant, q, v, self._applied(demanded, clip), of_plant))
 
-    def _clip(self, state: Tree, law: Int[Array, ""]) -> Int[Array, ""]:
-        demanded, limit = self._demand(state, law), self.plant.input_limit
+    def _clip(self, demanded: Float[Array, ""]) -> Int[Array, ""]:
+        limit = self.plant.input_limit
         return (demanded > limit).astype(jnp.int32) - (demanded < -limit).astype(jnp.int32)
 
-    def _applied(self, state: Tree, law: Int[Array, ""], clip: Int[Array, ""]) -> Float[Array, ""]:
+    def _applied(self, demanded: Float[Array, ""], clip: Int[Array, ""]) -> Float[Array, ""]:
         """Returns the applied voltage, with the demand clipped as `clip` says."""
         limit = self.plant.input_limit
-        return jnp.where(clip == 0, self._demand(state, law), jnp.where(clip > 0, limit, -limit))
+        return jnp.where(clip == 0, demanded, jnp.where(clip > 0, limit, -limit))
 
     def _demand(self, state: Tree, law: Int[Array, ""]) -> Float[Array, ""]:
         return demand(self.controller, state, law)

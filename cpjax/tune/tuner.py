@@ -71,11 +71,9 @@ def tune(
         store(checkpoint, tuner.identity, memory)
     while memory.step < plan.steps and not (plan.patience and memory.stale >= plan.patience):
         last = memory.history[-1]
-        say(
-            memory.step,
-            plan.steps,
-            f"loss {last['loss']:.3f}, success {100 * max(last['success_rates']):.1f} %, best {min(memory.scores):.3f}",
-        )
+        success = f"success {100 * max(last['success_rates']):.1f} %, best {min(memory.scores):.3f}"
+        # Candidates are screened by their scores: there is no loss before the first gradient.
+        say(memory.step, plan.steps, f"loss {last['loss']:.3f}, {success}" if memory.step else f"screened: {success}")
         memory = tuner.advance(memory)
         store(checkpoint, tuner.identity, memory)
     say(plan.steps, plan.steps, "last comparison")

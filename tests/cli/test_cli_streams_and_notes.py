@@ -501,13 +501,14 @@ def test_a_swing_up_that_does_not_settle_says_why_in_one_line(command, tmp_path,
     assert line.startswith(f"why: {reason}")
 
 
-def test_a_compilation_is_announced_once_and_before_the_step_that_waits_for_it():
+@pytest.mark.parametrize("first", ["screened", "loss"])  # of a new tuning, and of one that is resumed
+def test_a_compilation_is_announced_once_and_before_the_step_that_waits_for_it(first):
     lines = []
-    report = compiling(lambda done, total, text: lines.append(text), "loss")
-    for text in ("screening 8 candidates", "loss 3", "loss 2"):
+    report = compiling(lambda done, total, text: lines.append(text), "screened", "loss")
+    for text in ("screening 8 candidates", f"{first}: 3", "loss 2"):
         report(0, 2, text)
     assert lines == [
         "screening 8 candidates",
-        "loss 3; compiling the gradient (about a minute the first time)",
+        f"{first}: 3; compiling the gradient (about a minute the first time)",
         "loss 2",
     ]
