@@ -5,7 +5,7 @@ PYTHON ?= python3
 OUT ?= out
 BIN := .venv/bin
 
-.PHONY: report report-full test test-slow check format docs build clean
+.PHONY: report report-full test test-slow coverage check format docs build clean
 
 report: .venv/ready  ## the main job: the paper's controllers, reproduced, as one HTML page
 	$(BIN)/cpjax report --out $(OUT)/report
@@ -20,6 +20,9 @@ test: check  ## linter, type checker, tests with warnings as errors
 
 test-slow: .venv/ready-test  ## the tests that take minutes
 	$(BIN)/python -m pytest -n 2 -m slow
+
+coverage: .venv/ready-test  ## the tests of `make test`, and which lines and branches of cpjax/ they reach
+	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --cov
 
 check: .venv/ready-test
 	$(BIN)/ruff format --check .
