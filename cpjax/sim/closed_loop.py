@@ -21,8 +21,8 @@ from cpjax.sim.switching import Observation
 LIMIT, GATE = 0, 1
 """Indices of the guards on the continuous clock: the voltage limit, of either sign, and the controller's margin."""
 
-GATE_CROSSING = GATE + 1
-"""Value of `Sample.crossing` at a located change of the controller's mode."""
+GATE_CROSSING = 3
+"""Value of `Sample.crossing` at a located change of the controller's mode; 1 and 2 are the voltage limits."""
 
 
 class Mode(NamedTuple):

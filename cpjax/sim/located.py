@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from cpjax.backend.single_kernel import outline, single_kernel
 from cpjax.errors import InputError
 from cpjax.sim import failures, plants
-from cpjax.sim.closed_loop import GATE_CROSSING, ContinuousLoop, HeldLoop, HeldMode, System
+from cpjax.sim.closed_loop import GATE, GATE_CROSSING, LIMIT, ContinuousLoop, HeldLoop, HeldMode, System
 from cpjax.sim.control import Control, start_control, update_control
 from cpjax.sim.flags import CHATTER_LENGTH, Flag, nonfinite_flag, nonfinite_input
 from cpjax.sim.integrators import INTEGRATORS, Integrator, Step
@@ -124,6 +124,9 @@ def _sample(plant: Plant, loop: _Loop, before: Motion, dt: Step) -> Sample:
     held = isinstance(motion.mode, HeldMode)
     landed = (before.phase == LANDED) & ~failures.is_stopped(loop.flag)
     state = plants.state_of(plant, motion.q, motion.v)
+    crossing = before.guard + GATE_CROSSING + (1 if held else -GATE)
+    if not held:
+        crossing = jnp.where(before.guard == LIMIT, jnp.where(motion.current.output > 0.0, 1, 2), crossing)
     return Sample(
         time=motion.grid_index.astype(dt.dtype) * dt + motion.offset,
         elapsed=jnp.asarray(motion.elapsed),
@@ -136,7 +139,7 @@ def _sample(plant: Plant, loop: _Loop, before: Motion, dt: Step) -> Sample:
         outputs=plants.outputs(plant, state, motion.current.acceleration, motion.current.output),
         plant_mode=motion.mode.plant,
         flag=loop.flag,
-        crossing=jnp.where(landed, before.guard + (GATE_CROSSING if held else 0) + 1, 0),
+        crossing=jnp.where(landed, crossing, 0),
         crossing_speed=jnp.where(landed, -pick(before.slopes, before.guard), 0.0),
     )
 

@@ -206,6 +206,36 @@ class Elapsed:
         return (*memory, last.flag)
 
 
+@pytree
+class Located:
+    """For each value of `crossing`: how often it was seen, and the lowest and the highest voltage there."""
+
+    def init(self, sample):
+        none = jnp.zeros(4, sample.time.dtype)
+        return none, none + jnp.inf, none - jnp.inf
+
+    def update(self, memory, sample):
+        here = sample.crossing == jnp.arange(4, dtype=jnp.int32)
+        seen, lowest, highest = memory
+        return (
+            seen + here.astype(seen.dtype),
+            jnp.where(here, jnp.minimum(lowest, sample.voltage), lowest),
+            jnp.where(here, jnp.maximum(highest, sample.voltage), highest),
+        )
+
+    def finalize(self, memory, last):
+        return memory
+
+
+def test_a_crossing_is_numbered_by_its_limit_or_as_the_gates():
+    settings = {"duration": 2.4, "dt": 2e-3, "switching": "located"}
+    seen, lowest, highest = cpjax.measure(PLANT, loop(), NEAR, metrics=Located(), **settings)
+    assert np.all(seen[1:] > 0)
+    assert lowest[1] == pytest.approx(12.0)
+    assert highest[2] == pytest.approx(-12.0)
+    assert -12.0 < lowest[3] <= highest[3] < 12.0
+
+
 @pytest.mark.slow
 def test_with_coarse_steps_time_only_grows_and_the_supply_is_never_exceeded():
     draws = random_draws(1500, 3, jnp.float64)
