@@ -59,8 +59,8 @@ def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
     angle = angle.astype(jnp.result_type(angle, float)) if not jnp.issubdtype(angle.dtype, jnp.floating) else angle
     s, c, quadrant = outline(_reduced)(angle)
     odd = (quadrant & 1) == 1
-    sin, cos = jnp.where(odd, c, s), jnp.where(odd, s, c)
-    return jnp.where(quadrant >= 2, -sin, sin), jnp.where((quadrant == 1) | (quadrant == 2), -cos, cos)
+    sin, cos = lax.select(odd, c, s), lax.select(odd, s, c)
+    return lax.select(quadrant >= 2, -sin, sin), lax.select((quadrant == 1) | (quadrant == 2), -cos, cos)
 
 
 def _reduced(angle: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

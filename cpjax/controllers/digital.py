@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from cpjax.checks import call, pair, real
 from cpjax.controllers.protocol import Controller, Law, ModalController, as_sampled
 from cpjax.errors import InputError
+from cpjax.numeric.selection import where
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, count, number, part, pytree
 
@@ -105,5 +106,5 @@ class Digital:
         command = real("controller.update", command)
         least = self.dead_band * (1.0 + 1e-6)  # the band's edge itself gives 0 V
         # What the estimator is told is what the drive applies: in the band that is its edge, not the controller's wish.
-        sent = jnp.where(jnp.abs(command) < least, jnp.sign(command) * least, command)
+        sent = where(jnp.abs(command) < least, jnp.sign(command) * least, command)
         return DigitalMemory(estimator, inner, (sent, *later)), sent

@@ -13,6 +13,7 @@ import math
 import jax.numpy as jnp
 
 from cpjax.backend.trigonometry import sin_cos
+from cpjax.numeric.selection import where
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
 from cpjax.pytree import Scalars, number, part, pytree
@@ -63,4 +64,4 @@ class EnergySwingUp:
         half_edge, _ = sin_cos(0.5 * self.kick_radius)  # 1 - cos(edge) = 2 sin(edge / 2)^2, without cancellation
         room = 1.0 - above_rest * (0.5 / (half_edge * half_edge))
         inside = jnp.maximum(room, 0.0)  # the cube below smooths its kink
-        return jnp.where(self.kick == 0.0, 0.0, inside * inside * inside)
+        return where(self.kick == 0.0, 0.0, inside * inside * inside)

@@ -19,6 +19,7 @@ from cpjax.controllers.feedback import PoleFactors
 from cpjax.errors import InputError
 from cpjax.linear.discretization import discretize
 from cpjax.linear.estimation import dlqe
+from cpjax.numeric.selection import where
 from cpjax.plant import CartPole, linearize
 from cpjax.plant.state import NAMES, State
 from cpjax.pytree import JaxOrNumpy, Number, Scalar, choice, matrix, number, part, pytree
@@ -241,7 +242,7 @@ class KalmanFilter:
         ):
             values, P = _corrected(values, P, at, measured, deviation * deviation)
         found, before = (State(*values), P), (memory.state, memory.covariance)
-        state, P = jax.tree.map(lambda new, old: jnp.where(memory.started > 0.0, new, old), found, before)
+        state, P = jax.tree.map(lambda new, old: where(memory.started > 0.0, new, old), found, before)
         return Belief(state, P, jnp.ones_like(memory.started))
 
     def predict(self, state: State, command: Scalar) -> State:

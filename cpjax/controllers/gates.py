@@ -10,13 +10,13 @@ below zero for any useful level.
 import math
 from typing import Any, Protocol, runtime_checkable
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.controllers.protocol import REGULATE
 from cpjax.errors import InputError
+from cpjax.numeric.selection import where
 from cpjax.plant.state import NAMES, UPRIGHT, State, checked_reference, deviation
 from cpjax.pytree import JaxOrNumpy, Scalar, Scalars, is_traced, matrix, number, part, pytree
 
@@ -45,7 +45,7 @@ class AngleGate:
         _, cos = sin_cos(state.theta)
         # Both edges, then one of them is selected: they do not depend on the state, so a batch computes them once.
         (_, way_in), (_, way_out) = sin_cos(self.half_angle), sin_cos(self.half_angle * (1.0 + self.hysteresis))
-        return cos - jnp.where(mode == REGULATE, way_out, way_in)
+        return cos - where(mode == REGULATE, way_out, way_in)
 
 
 @pytree
@@ -67,7 +67,7 @@ class AngleRateGate:
         _, cos = sin_cos(state.theta)
         # Both regions, then one of them is selected: they do not depend on the state, so a batch computes them once.
         way_in, way_out = self._scales(0.0), self._scales(self.hysteresis)
-        per_drop, per_rate = (jnp.where(mode == REGULATE, b, a) for a, b in zip(way_in, way_out, strict=True))
+        per_drop, per_rate = (where(mode == REGULATE, b, a) for a, b in zip(way_in, way_out, strict=True))
         relative_rate = state.theta_dot * per_rate
         return 1.0 - (1.0 - cos) * per_drop - relative_rate * relative_rate
 
@@ -97,7 +97,7 @@ class LyapunovGate:
         s = deviation(state, self.reference)
         # Written as a sum, not as a matrix product, so that under vmap each component stays an array of its own.
         form = sum(self.P[i, j] * s[i] * s[j] for i in range(4) for j in range(4))
-        return jnp.where(mode == REGULATE, 1.0 + self.hysteresis, 1.0) - form * (1.0 / self.level)
+        return where(mode == REGULATE, 1.0 + self.hysteresis, 1.0) - form * (1.0 / self.level)
 
 
 def _check_widened_angle(gate: str, half_angle: Any, hysteresis: Any) -> None:

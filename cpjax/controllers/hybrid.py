@@ -8,6 +8,7 @@ from jaxtyping import Array, Int
 from cpjax.checks import call, real
 from cpjax.controllers.gates import AngleGate, AngleRateGate, Gate, LyapunovGate
 from cpjax.controllers.protocol import REGULATE, SWING_UP, Law, ModeMemory, start_memory, update_mode
+from cpjax.numeric.selection import where
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, part, pytree
 
@@ -41,7 +42,7 @@ class Hybrid:
 
     def next_mode(self, state: State, mode: Int[Array, ""]) -> Int[Array, ""]:
         """Returns REGULATE where the gate's margin in the present mode is at least 0, else SWING_UP; no derivative."""
-        return jnp.where(self._gate_margin(state, mode) >= 0.0, np.int32(REGULATE), np.int32(SWING_UP))
+        return where(self._gate_margin(state, mode) >= 0.0, np.int32(REGULATE), np.int32(SWING_UP))
 
     def mode_voltage(self, state: State, mode: Int[Array, ""]) -> Scalar:
         """Returns the demanded voltage [V] of the law of `mode`.
@@ -52,17 +53,17 @@ class Hybrid:
             real(f"controller.{name}.voltage", call(f"controller.{name}", getattr(self, name), "voltage", state))
             for name in ("regulator", "swing_up")
         )
-        voltage = jnp.where(mode == REGULATE, regulate, swing_up)
+        voltage = where(mode == REGULATE, regulate, swing_up)
         if isinstance(self.gate, _FINITE_GATES):
             return voltage
         # A margin that is NaN chooses no mode. So that it does not pass for "outside", the run is to fail.
         margin = self._gate_margin(state, mode)
-        return jnp.where(jnp.isnan(margin), jnp.asarray(jnp.nan, voltage.dtype), voltage)
+        return where(jnp.isnan(margin), jnp.asarray(jnp.nan, voltage.dtype), voltage)
 
     def margin(self, state: State, mode: Int[Array, ""]) -> Scalar:
         """Returns the gate's margin, with the sign that makes it positive while `mode` lasts."""
         margin = self._gate_margin(state, mode)
-        return jnp.where(mode == REGULATE, margin, -margin)
+        return where(mode == REGULATE, margin, -margin)
 
     def successor(self, mode: Int[Array, ""]) -> Int[Array, ""]:
         """Returns the other mode."""

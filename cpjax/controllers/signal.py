@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int32
 
 from cpjax.errors import InputError
+from cpjax.numeric.selection import where
 from cpjax.pytree import JaxOrNumpy, Scalar, is_traced, matrix, pytree
 
 
@@ -69,7 +70,7 @@ class VoltageSignal:
         # If the signal is finer than the control period, several of its times are due at once.
         following = lax.while_loop(is_due, lambda index: index + 1, memory.next)
         voltage = lax.dynamic_index_in_dim(voltages, jnp.maximum(following - 1, 0), keepdims=False)
-        return SignalMemory(memory.samples + 1, following), jnp.where(following > 0, voltage, 0.0)
+        return SignalMemory(memory.samples + 1, following), where(following > 0, voltage, 0.0)
 
     def _is_due(self, time: jax.Array, samples: jax.Array) -> jax.Array:
         """Returns whether a time of the signal is not after this control instant, up to rounding."""

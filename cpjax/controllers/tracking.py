@@ -17,6 +17,7 @@ from cpjax.controllers.protocol import REGULATE, Controller, Law, ModalControlle
 from cpjax.controllers.signal import SignalMemory, VoltageSignal
 from cpjax.errors import InputError
 from cpjax.linear.lqr import lqr
+from cpjax.numeric.selection import where
 from cpjax.plant import CartPole, linearize
 from cpjax.plant.state import State
 from cpjax.pytree import Number, Scalar, number, part, pytree
@@ -103,14 +104,14 @@ class IntegralAction:
         wanted = real("controller.update", wanted)
         modes = modes_in(inner)
         regulates = jnp.asarray(True) if not modes else modes[0].mode == REGULATE
-        integral = jnp.where(regulates, memory.integral, 0.0)
+        integral = where(regulates, memory.integral, 0.0)
         command = wanted - self.gain * integral
         error = measurement.x - self.reference_x
         further = -self.gain * error * jnp.sign(command) > 0.0
         grows = (
             regulates & (jnp.abs(measurement.x_dot) <= self.slow) & ~((jnp.abs(command) > self.voltage_limit) & further)
         )
-        return IntegralMemory(inner, integral + jnp.where(grows, self.period * error, 0.0)), command
+        return IntegralMemory(inner, integral + where(grows, self.period * error, 0.0)), command
 
 
 class ReferenceMemory(NamedTuple):

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from cpjax.numeric.selection import where
+
 
 class Loop(NamedTuple):
     """Realisation of T(s) = K (sI - F)^-1 B, with F = A - B K."""
@@ -107,12 +109,12 @@ def _on_axis(zeros: jax.Array) -> jax.Array:
     No zero is rejected for its real part, which is subject to rounding: a superfluous candidate does no harm.
     """
     usable = jnp.isfinite(zeros.imag) & (zeros.imag > 0.0)
-    return jnp.sort(jnp.where(usable, zeros.imag, 0.0))[zeros.shape[0] // 2 :]
+    return jnp.sort(where(usable, zeros.imag, 0.0))[zeros.shape[0] // 2 :]
 
 
 def _largest(vector: jax.Array) -> jax.Array:
     largest = jnp.max(jnp.abs(vector))
-    return jnp.where(largest > 0.0, largest, 1.0)
+    return where(largest > 0.0, largest, 1.0)
 
 
 def epsilon(array: jax.Array) -> float:
@@ -135,14 +137,14 @@ def root_near(condition: _OfFrequency, guess: jax.Array, loop: Loop, scale: jax.
     def newton(_: Any, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         frequency, _ = carry
         value, slope = _with_slope(condition, frequency, fixed)
-        step = jnp.where(value == 0.0, 0.0, value / slope)
+        step = where(value == 0.0, 0.0, value / slope)
         return jnp.abs(frequency - jnp.clip(step, -frequency, frequency)), jnp.abs(step)
 
-    start = jnp.where(guess > 0.0, guess, scale)
+    start = where(guess > 0.0, guess, scale)
     frequency, step = lax.fori_loop(0, 5, newton, (start, start))
     valid = (guess > 0.0) & (frequency > 0.0) & (step <= epsilon(guess) ** (1 / 3) * frequency)
-    frequency = tied(condition, jnp.where(valid, frequency, scale), loop)
-    return Crossovers(jnp.where(valid, frequency, scale), valid)
+    frequency = tied(condition, where(valid, frequency, scale), loop)
+    return Crossovers(where(valid, frequency, scale), valid)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -159,4 +161,4 @@ def _tied_jvp(
     frequency = tied(condition, frequency, loop)
     _, slope = _with_slope(condition, frequency, loop)
     _, change = jax.jvp(lambda moved: condition(frequency, moved), (loop,), (tangents[1],))
-    return frequency, -change / jnp.where(slope == 0.0, jnp.inf, slope)
+    return frequency, -change / where(slope == 0.0, jnp.inf, slope)

@@ -21,6 +21,7 @@ from jax import lax
 from cpjax.linear.lyapunov import Sum, cayley_shift, sum_continuous, sum_discrete
 from cpjax.numeric import double_word as dw
 from cpjax.numeric.double_word import DoubleWord, double_word
+from cpjax.numeric.selection import where
 from cpjax.numeric.small_matrices import (
     Matrix,
     accurate_product,
@@ -128,7 +129,7 @@ def _found(
     def again() -> tuple[Matrix, Matrix]:
         start = _double(problem, _ACCURATE, _terminal_weight(problem))
         more = _corrected(start, correction, gain, missed)
-        return jnp.where(missed, more[0], P), jnp.where(missed, more[1], K)
+        return where(missed, more[0], P), where(missed, more[1], K)
 
     found: tuple[Matrix, Matrix] = lax.cond(jnp.any(missed), again, lambda: (P, K))
     return found
@@ -151,7 +152,7 @@ def _terminal_weight(problem: _Doubled) -> Matrix:
         term = product(E, term, transpose(E)) / growth
         total = total + term
     weight = 1.0 / diagonal(total)
-    return identity * jnp.where((weight > 0.0) & jnp.isfinite(weight), weight, 0.0)
+    return identity * where((weight > 0.0) & jnp.isfinite(weight), weight, 0.0)
 
 
 def _without_cross_term(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> tuple[Matrix, Matrix, Matrix]:
@@ -164,7 +165,7 @@ def _without_cross_term(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -
 def _balance(G: Matrix, H: Matrix) -> jax.Array:
     """Returns the factor that makes G and H equally large; P is scaled by its reciprocal."""
     scale = jnp.sqrt(largest(H) / largest(G))
-    return jnp.where((scale > 0.0) & jnp.isfinite(scale), scale, 1.0)
+    return where((scale > 0.0) & jnp.isfinite(scale), scale, 1.0)
 
 
 def _cayley(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> _Doubled:
@@ -181,14 +182,14 @@ def _cayley(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, N: Matrix) -> _Doubled:
         resolvent = shift * inverse(shift * identity - A)
         coupled = shift * inverse(shift * identity - transpose(A) + product(H, resolvent / shift, G))
         size = jnp.maximum(largest(resolvent), largest(coupled))
-        return resolvent, coupled, jnp.where(jnp.isfinite(size), size, jnp.inf)
+        return resolvent, coupled, where(jnp.isfinite(size), size, jnp.inf)
 
     # The shift is near the geometric mean of the closed loop's eigenvalues; the factors prevent it from being an
     # eigenvalue of A by construction. It may still be one by chance: of two shifts, the one farther away is taken.
     *one, near = inverses(1.0987 * shift)
     *other, far = inverses(1.4321 * shift)
-    resolvent, coupled = (jnp.where(near <= far, x, y) for x, y in zip(one, other, strict=True))
-    shift = jnp.where(near <= far, 1.0987, 1.4321) * shift
+    resolvent, coupled = (where(near <= far, x, y) for x, y in zip(one, other, strict=True))
+    shift = where(near <= far, 1.0987, 1.4321) * shift
     E = 2.0 * transpose(coupled) - identity
     G = 2.0 * product(resolvent, G, coupled) / shift
     H = 2.0 * product(coupled, H, resolvent) / shift
@@ -297,14 +298,14 @@ def _corrected(
     carry = (double_word(start.P), unknown, jnp.full_like(unknown, jnp.inf), stable, count)
     P, size, _, stable, _ = lax.while_loop(unfinished, correct, carry)
     found = valid & start.plausible & stable & (size <= eps**0.75)
-    return jnp.where(found, P.high, jnp.nan), jnp.where(found, gain(P)[0].high, jnp.nan)
+    return where(found, P.high, jnp.nan), where(found, gain(P)[0].high, jnp.nan)
 
 
 def _weights_are_valid(Q: Matrix, R: Matrix, N: Matrix) -> jax.Array:
     """Returns whether R is positive definite and [[Q, N], [N', R]] positive semidefinite, to rounding."""
     H = symmetric(Q - product(N, inverse(R), transpose(N)))
     size = jnp.sqrt(jnp.abs(diagonal(Q)))
-    size = jnp.where(size > 0.0, size, 1.0)
+    size = where(size > 0.0, size, 1.0)
     room = 16.0 * H.shape[0] * np.finfo(H.dtype).eps * identity_like(H)
     return is_positive_definite(R) & is_positive_definite(H / (size[:, None] * size[None]) + room)
 

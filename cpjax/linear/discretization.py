@@ -26,6 +26,7 @@ from jaxtyping import Array, Float, Real
 
 from cpjax.errors import InputError
 from cpjax.linear.arguments import MatrixLike, columns, input_weight, matrices, shaped, square
+from cpjax.numeric.selection import where
 from cpjax.numeric.small_matrices import product, symmetric, transpose
 from cpjax.pytree import Scalar, is_traced
 
@@ -142,7 +143,7 @@ def _cost(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, period: jax.Ar
 def _flow(A: jax.Array, B: jax.Array, period: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Returns F times the period, and the unit of the input in which B is below 1."""
     m = B.shape[1]
-    period = jnp.where(period > 0, period, jnp.nan)
+    period = where(period > 0, period, jnp.nan)
     unit = _power_of_two(_exponent(B * period), B)
     return jnp.pad(jnp.concatenate([A * period, B * period / unit], axis=1), ((0, m), (0, 0))), unit
 
@@ -164,7 +165,7 @@ def _repeat(function: Callable[[T], T], value: T, times: jax.Array) -> T:
     def body(value: T, index: jax.Array) -> tuple[T, None]:
         return lax.cond(index < times, function, lambda value: value, value), None
 
-    value = jax.tree.map(lambda x: jnp.where(times <= _MOST_HALVINGS, x, jnp.nan), value)
+    value = jax.tree.map(lambda x: where(times <= _MOST_HALVINGS, x, jnp.nan), value)
     return lax.scan(body, value, jnp.arange(_MOST_HALVINGS, dtype=times.dtype))[0]
 
 

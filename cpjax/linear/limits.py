@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Real
 from cpjax.errors import InputError
 from cpjax.linear.arguments import MatrixLike, columns, gain_matrix, matrices, shaped, square
 from cpjax.linear.lyapunov import lyapunov
+from cpjax.numeric.selection import where
 from cpjax.numeric.small_matrices import is_positive_definite, linear_solve
 from cpjax.pytree import JaxOrNumpy, Number, Scalar, is_traced
 
@@ -172,8 +173,8 @@ def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -
     # position moves by a step of Newton's method; where the level is the same everywhere, it stays.
     slope = jax.grad(level)
     bend = jax.grad(slope)(position, *fixed)
-    step = slope(position, *gate) / jnp.where(bend > 0.0, bend, 1.0)
-    return level(position - jnp.where(bend > 0.0, step, 0.0), *gate)
+    step = slope(position, *gate) / where(bend > 0.0, bend, 1.0)
+    return level(position - where(bend > 0.0, step, 0.0), *gate)
 
 
 def level_within_form(P: Real[MatrixLike, "n n"], other: Real[MatrixLike, "n n"], level: Scalar) -> Float[Array, ""]:
@@ -215,7 +216,7 @@ def _positive_definite(name: str, P: jax.Array, size: int | None = None) -> jax.
     definite = _is_positive_definite(P)
     if not is_traced(definite) and not definite:
         raise InputError(name, P, "positive definite, by a margin that rounding leaves visible")
-    return jnp.where(definite, P, jnp.nan)
+    return where(definite, P, jnp.nan)
 
 
 def _limit(name: str, unit: str, value: Scalar, like: jax.Array, **ends: Any) -> jax.Array:

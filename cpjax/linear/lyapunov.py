@@ -20,6 +20,7 @@ from cpjax.errors import InputError
 from cpjax.linear.arguments import MatrixLike, matrices, shaped, square
 from cpjax.numeric import double_word as dw
 from cpjax.numeric.double_word import double_word
+from cpjax.numeric.selection import where
 from cpjax.numeric.small_matrices import (
     Matrix,
     accurate_product,
@@ -139,7 +140,7 @@ def _lyapunov(A: Matrix, Q: Matrix) -> Matrix:
     a, x = double_word(A), double_word(X)
     rest = dw.add(accurate_product(transpose(a), x), accurate_product(x, a))
     more, _ = sum_continuous(A, dw.add(double_word(Q), rest).high)
-    return jnp.where(stable, X + more, jnp.nan)
+    return where(stable, X + more, jnp.nan)
 
 
 @batch_last
@@ -149,4 +150,4 @@ def _stein(A: Matrix, Q: Matrix) -> Matrix:
     a, x = double_word(A), double_word(X)
     rest = dw.add(accurate_product(transpose(a), accurate_product(x, a)), dw.negative(x))
     more, _ = sum_discrete(A, dw.add(double_word(Q), rest).high)
-    return jnp.where(stable, X + more, jnp.nan)
+    return where(stable, X + more, jnp.nan)

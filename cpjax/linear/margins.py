@@ -35,6 +35,7 @@ from cpjax.linear._crossovers import (
     transfer,
 )
 from cpjax.linear.arguments import MatrixLike, column, columns, gain_matrix, matrices, square
+from cpjax.numeric.selection import where
 
 
 class Margins(NamedTuple):
@@ -184,8 +185,8 @@ def _margins(A: jax.Array, B: jax.Array, K: jax.Array) -> Margins:
     poles = jnp.linalg.eigvals(lax.stop_gradient(closed))  # for scale and stability only; gradient NaN where two meet
     stable = jnp.all(poles.real < 0.0)
     # A stable replacement keeps numbers and derivatives finite where the result will be NaN.
-    closed = jnp.where(stable, closed, -jnp.eye(A.shape[0], dtype=A.dtype))
-    poles = jnp.where(stable, poles, -jnp.ones_like(poles))
+    closed = where(stable, closed, -jnp.eye(A.shape[0], dtype=A.dtype))
+    poles = where(stable, poles, -jnp.ones_like(poles))
     loop = Loop(closed, B, K)
     scale = jnp.exp(jnp.mean(jnp.log(jnp.abs(poles))))
 
@@ -196,9 +197,9 @@ def _margins(A: jax.Array, B: jax.Array, K: jax.Array) -> Margins:
     peak, frequency = _peak(loop, scale, jnp.concatenate([jnp.abs(poles), jnp.abs(poles.imag), crossovers.frequency]))
     root = jnp.sqrt(1.0 + 4.0 * peak)  # twice the largest |T - 1/2|
     bounded = peak > 0.0
-    disk_gain = jnp.where(bounded, (root + 1.0) ** 2 / (4.0 * jnp.where(bounded, peak, 1.0)), jnp.inf)
+    disk_gain = where(bounded, (root + 1.0) ** 2 / (4.0 * where(bounded, peak, 1.0)), jnp.inf)
     found = (*lower, *upper, *phase, *delay, 2.0 / root, frequency, disk_gain, 2.0 * jnp.arctan(1.0 / root))
-    return Margins(stable, *(jnp.where(stable, value, jnp.nan) for value in found))
+    return Margins(stable, *(where(stable, value, jnp.nan) for value in found))
 
 
 _Margin: TypeAlias = tuple[jax.Array, jax.Array]
@@ -231,9 +232,9 @@ def _gain_margins(crossovers: Crossovers, loop: Loop) -> tuple[_Margin, _Margin]
     T = jax.vmap(transfer, in_axes=(0, None))(frequency, loop).real
     tolerance = math.sqrt(epsilon(T))
     below, above = valid & (T * (1.0 - tolerance) > 1.0), valid & (T + tolerance < 0.0)
-    factor = 1.0 - 1.0 / jnp.where(below | above, T, 1.0)
-    lower = _pick(jnp.argmax(jnp.where(below, T, -jnp.inf)), below, factor, frequency, 0.0)
-    upper = _pick(jnp.argmin(jnp.where(above, T, jnp.inf)), above, factor, frequency, jnp.inf)
+    factor = 1.0 - 1.0 / where(below | above, T, 1.0)
+    lower = _pick(jnp.argmax(where(below, T, -jnp.inf)), below, factor, frequency, 0.0)
+    upper = _pick(jnp.argmin(where(above, T, jnp.inf)), above, factor, frequency, jnp.inf)
     return lower, upper
 
 
@@ -244,13 +245,13 @@ def _phase_and_delay_margins(crossovers: Crossovers, loop: Loop) -> tuple[_Margi
     delay = (math.pi + 2.0 * jnp.arctan(2.0 * y)) / frequency  # a delay only lags: (pi + arg L) / frequency
 
     def least(values: jax.Array) -> _Margin:
-        return _pick(jnp.argmin(jnp.where(valid, values, jnp.inf)), valid, values, frequency, jnp.inf)
+        return _pick(jnp.argmin(where(valid, values, jnp.inf)), valid, values, frequency, jnp.inf)
 
     return least(phase), least(delay)
 
 
 def _pick(index: jax.Array, valid: jax.Array, values: jax.Array, frequencies: jax.Array, otherwise: float) -> _Margin:
-    return jnp.where(valid[index], values[index], otherwise), jnp.where(valid[index], frequencies[index], jnp.nan)
+    return where(valid[index], values[index], otherwise), where(valid[index], frequencies[index], jnp.nan)
 
 
 class _Ascent(NamedTuple):
@@ -295,8 +296,8 @@ def _peak(loop: Loop, scale: jax.Array, frequencies: jax.Array) -> _Margin:
     ascent = lax.while_loop(lambda ascent: ascent.rising & (ascent.rounds < 30), rise, ascent)
 
     bounded = jnp.isfinite(ascent.frequency)
-    polished, valid = root_near(excess_slope, jnp.where(bounded, ascent.frequency, 0.0), loop, scale)
+    polished, valid = root_near(excess_slope, where(bounded, ascent.frequency, 0.0), loop, scale)
     # Newton's method may have gone to another stationary point.
     same = valid & (excess(polished, fixed) > 0.999 * ascent.level)
-    frequency = jnp.where(same, polished, ascent.frequency)
-    return jnp.where(bounded, excess(jnp.where(bounded, frequency, scale), loop), 0.0), frequency
+    frequency = where(same, polished, ascent.frequency)
+    return where(bounded, excess(where(bounded, frequency, scale), loop), 0.0), frequency

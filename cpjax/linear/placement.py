@@ -29,6 +29,7 @@ from cpjax.linear.arguments import MatrixLike, column, columns, matrices, shaped
 from cpjax.linear.several_inputs import gain_by_directions, robust_gain
 from cpjax.numeric import double_word as dw
 from cpjax.numeric.double_word import DoubleWord, double_word
+from cpjax.numeric.selection import where
 from cpjax.numeric.small_matrices import (
     Matrix,
     accurate_product,
@@ -131,7 +132,7 @@ def polynomial_from_poles(poles: Num[ArrayLike, " n"] | Sequence[complex]) -> Fl
         paired = jnp.all(jnp.abs(whole.imag) <= 1e-6 * bound)
         if not is_traced(paired) and not paired:
             raise InputError("poles", poles, "finite, and closed under conjugation: complex ones in pairs")
-        whole = jnp.where(paired, whole.real, jnp.nan)
+        whole = where(paired, whole.real, jnp.nan)
     if not is_traced(whole) and not np.all(np.isfinite(whole)):
         raise InputError("poles", poles, "finite numbers")
     return whole[1:]
@@ -211,7 +212,7 @@ class QuadraticFactors(NamedTuple):
         root = jnp.sqrt(lax.complex(self.a * self.a / 4 - self.b, jnp.zeros_like(self.a)))
         # The larger root: in the formula for the other one, the digits of a slow pole would cancel.
         first = -root - (0.5 * self.a).astype(root.dtype)
-        second = jnp.where(root.imag > 0.0, first.conj(), self.b.astype(root.dtype) / first)
+        second = where(root.imag > 0.0, first.conj(), self.b.astype(root.dtype) / first)
         return jnp.concatenate([second, first, -self.c.astype(root.dtype)])
 
 
@@ -261,7 +262,7 @@ def _ackermann(A: Matrix, B: Matrix, coefficients: jax.Array) -> _Placement:
     blur = np.finfo(A.dtype).eps * jnp.sum(jnp.abs(by_element) * size[None], axis=(1, 2))
     found = jnp.all(blur <= 0.01 * jnp.max(jnp.abs(gain), axis=0), axis=0)
     parts = K.high, by_coefficient.high, by_element
-    return _Placement(*(jnp.where(found, part, jnp.nan) for part in parts))
+    return _Placement(*(where(found, part, jnp.nan) for part in parts))
 
 
 def _side_by_side(columns: list[DoubleWord]) -> DoubleWord:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int32, Real
 from cpjax.errors import InputError
 from cpjax.linear.arguments import MatrixLike, columns, matrices, rows, square
 from cpjax.linear.lyapunov import lyapunov
+from cpjax.numeric.selection import where
 from cpjax.pytree import Number, Scalar, is_traced
 
 POSITION_AND_ANGLE = ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
@@ -176,7 +177,7 @@ def _structure(matrix: jax.Array) -> Structure:
     values = jnp.linalg.svd(matrix, compute_uv=False)
     tolerance = max(matrix.shape) * float(np.finfo(matrix.dtype).eps) * values[0]
     regular = values[-1] > 0.0
-    condition = jnp.where(regular, values[0] / jnp.where(regular, values[-1], 1.0), jnp.inf)
+    condition = where(regular, values[0] / where(regular, values[-1], 1.0), jnp.inf)
     return Structure(matrix, jnp.sum(values > tolerance).astype(jnp.int32), values, condition)
 
 
@@ -204,7 +205,7 @@ def _gramian_until(A: jax.Array, Q: jax.Array, horizon: jax.Array) -> jax.Array:
     short = horizon * jnp.exp2(-doublings)
     # W is linear in Q; in this unit Q does not make the block large. The unit cancels, so it needs no derivative.
     unit = lax.stop_gradient(jnp.max(jnp.abs(Q)) * short)
-    unit = jnp.where(unit > 0.0, unit, 1.0)
+    unit = where(unit > 0.0, unit, 1.0)
     block = jnp.block([[-A, Q / unit], [jnp.zeros_like(A), A.T]])
     exponential = jax.scipy.linalg.expm(block * short)
     flow = exponential[n:, n:].T
@@ -213,8 +214,8 @@ def _gramian_until(A: jax.Array, Q: jax.Array, horizon: jax.Array) -> jax.Array:
         flow, W = carry
         active = i < doublings
         # Inactive steps compute with 0, so that nothing overflows in a branch that is not taken.
-        e = jnp.where(active, flow, 0.0)
-        return (jnp.where(active, e @ e, flow), W + e @ W @ e.T), None
+        e = where(active, flow, 0.0)
+        return (where(active, e @ e, flow), W + e @ W @ e.T), None
 
     (_, W), _ = lax.scan(double, (flow, flow @ exponential[:n, n:]), jnp.arange(_MOST_DOUBLINGS, dtype=A.dtype))
     return 0.5 * unit * (W + W.T)

@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from cpjax.numeric.selection import where
 from cpjax.pytree import Scalar
 
 _ITERATIONS = 8
@@ -41,13 +42,13 @@ def crossing_fraction(start: Scalar, start_slope: Scalar, end: Scalar, end_slope
     low, high = jnp.zeros_like(rise), jnp.ones_like(rise)
     above = jnp.maximum(start, 0.0)
     # A start value of zero is a root, but not the wanted one if the function rises from there.
-    t = jnp.where(above > 0.0, above / jnp.where(above > end, above - end, 1.0), 0.5)
+    t = where(above > 0.0, above / where(above > end, above - end, 1.0), 0.5)
     for _ in range(_ITERATIONS):
         value = start + t * (start_slope + t * (second + t * third))
         slope = start_slope + t * (2.0 * second + t * (3.0 * third))
-        low, high = jnp.where(value >= 0.0, t, low), jnp.where(value >= 0.0, high, t)
+        low, high = where(value >= 0.0, t, low), where(value >= 0.0, high, t)
         newton = t - value / slope
-        t = jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        t = where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
     return t
 
 

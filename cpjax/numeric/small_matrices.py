@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from cpjax.numeric import double_word as dw
 from cpjax.numeric.double_word import DoubleWord
+from cpjax.numeric.selection import where
 
 Matrix: TypeAlias = Float[Array, "_ _ ..."]
 """A matrix of any size, with any batch axes."""
@@ -104,15 +105,15 @@ def _eliminate(rows: Matrix) -> tuple[Matrix, jax.Array]:
             row, index = found
             candidate = _row(rows, i)
             better = jnp.abs(_row(candidate, k)) > jnp.abs(_row(row, k))
-            return jnp.where(better, candidate, row), jnp.where(better, i, index)
+            return where(better, candidate, row), where(better, i, index)
 
         row, index = lax.fori_loop(k + 1, n, search, (row_k, jnp.full(rows.shape[2:], k)))
         pivot = _row(row, k)
         pivot_row = row / pivot
-        rows = jnp.where(numbers == index, row_k, rows)  # row k replaces the pivot row
-        rows = jnp.where(numbers == k, pivot_row, rows - _column(rows, k)[:, None] * pivot_row)
+        rows = where(numbers == index, row_k, rows)  # row k replaces the pivot row
+        rows = where(numbers == k, pivot_row, rows - _column(rows, k)[:, None] * pivot_row)
         # After a pivot of zero the rows are NaN, but the determinant is known.
-        return rows, jnp.where(log_determinant == -jnp.inf, -jnp.inf, log_determinant + jnp.log(jnp.abs(pivot)))
+        return rows, where(log_determinant == -jnp.inf, -jnp.inf, log_determinant + jnp.log(jnp.abs(pivot)))
 
     return lax.fori_loop(0, n, step, (rows, jnp.zeros_like(rows[0, 0])))
 
@@ -150,15 +151,15 @@ def accurate_solve(a: DoubleWord, b: DoubleWord) -> DoubleWord:
             row, index = found
             candidate = DoubleWord(*(_row(x, i) for x in rows))
             better = jnp.abs(_row(candidate.high, k)) > jnp.abs(_row(row.high, k))
-            row = DoubleWord(*(jnp.where(better, x, y) for x, y in zip(candidate, row, strict=True)))
-            return row, jnp.where(better, i, index)
+            row = DoubleWord(*(where(better, x, y) for x, y in zip(candidate, row, strict=True)))
+            return row, where(better, i, index)
 
         row, index = lax.fori_loop(k + 1, n, search, (row_k, jnp.full(rows.high.shape[2:], k)))
         pivot_row = dw.divide(row, DoubleWord(*(_row(x, k) for x in row)))
-        rows = DoubleWord(*(jnp.where(numbers == index, x, y) for x, y in zip(row_k, rows, strict=True)))
+        rows = DoubleWord(*(where(numbers == index, x, y) for x, y in zip(row_k, rows, strict=True)))
         column = DoubleWord(*(-_column(x, k)[:, None] for x in rows))
         reduced = dw.add(rows, dw.multiply(column, pivot_row))
-        return DoubleWord(*(jnp.where(numbers == k, x, y) for x, y in zip(pivot_row, reduced, strict=True)))
+        return DoubleWord(*(where(numbers == k, x, y) for x, y in zip(pivot_row, reduced, strict=True)))
 
     rows = lax.fori_loop(0, n, step, rows)
     return DoubleWord(*(x[:, n:] for x in rows))

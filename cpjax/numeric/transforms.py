@@ -6,6 +6,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from cpjax.errors import InputError
+from cpjax.numeric.selection import where
 from cpjax.pytree import is_traced
 
 
@@ -56,11 +57,11 @@ def from_semidefinite(Q: Float[Array, "n n"]) -> Float[Array, " triangle"]:
     for k in range(n):
         pivot = rest[k, k]
         holds = pivot > room[k]
-        column = jnp.where(holds, rest[:, k] / jnp.sqrt(jnp.where(holds, pivot, 1.0)), 0.0)
+        column = where(holds, rest[:, k] / jnp.sqrt(where(holds, pivot, 1.0)), 0.0)
         # No element of a semidefinite matrix exceeds the geometric mean of its diagonal ones, except by rounding.
         left = lax.stop_gradient(jnp.maximum(jnp.diagonal(rest), 0.0)) ** 0.5
-        column = jnp.where(jnp.abs(column) > 1.0001 * left, jnp.sign(column) * left, column)
-        column = jnp.where(jnp.arange(n) >= k, column, 0.0)
+        column = where(jnp.abs(column) > 1.0001 * left, jnp.sign(column) * left, column)
+        column = where(jnp.arange(n) >= k, column, 0.0)
         rest = rest - column[:, None] * column[None]
         columns.append(column)
     return jnp.stack(columns, axis=1)[jnp.tril_indices(n)]

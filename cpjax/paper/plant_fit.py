@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from cpjax.numeric.selection import where
 from cpjax.numeric.small_matrices import linear_solve
 from cpjax.paper.printed_gains import PrintedGain
 from cpjax.plant import CartPole, Motor, parameter, parameters_of, with_parameters
@@ -228,12 +229,12 @@ def least_squares(
         r, J = residuals(trial)
         tried = (jnp.sum(r * r), trial, r, J)
         better = tried[0] < best[0]  # False for NaN
-        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, best)
-        damping = jnp.clip(jnp.where(better, damping / 5.0, damping * 4.0), 1e-12, 1e8)
+        best = jax.tree.map(lambda new, old: where(better, new, old), tried, best)
+        damping = jnp.clip(where(better, damping / 5.0, damping * 4.0), 1e-12, 1e8)
         _, x, r, J = best
         H = J.T @ J
         scale = jnp.diagonal(H)
-        damped = H + damping * jnp.diag(jnp.where(scale > 0.0, scale, 1.0))
+        damped = H + damping * jnp.diag(where(scale > 0.0, scale, 1.0))
         # A change by more than a factor of e in one step would leave the region where the linearisation holds.
         return (x - jnp.clip(linear_solve(damped, (J.T @ r)[:, None])[:, 0], -1.0, 1.0), best, damping), None
 

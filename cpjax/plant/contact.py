@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from cpjax.numeric.selection import where
 from cpjax.plant.cartpole import Pair
 from cpjax.plant.motor import AccelerationActuator
 from cpjax.plant.state import State
@@ -114,8 +115,8 @@ class InContact:
         x_ddot, theta_ddot = self.free.solved(geometry[0], geometry[1], push, torque)
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)
-        x_ddot = jnp.where(resting, 0.0, jnp.where(held, alone_x, x_ddot))
-        theta_ddot = jnp.where(held, 0.0, jnp.where(resting, alone_theta, theta_ddot))
+        x_ddot = where(resting, 0.0, where(held, alone_x, x_ddot))
+        theta_ddot = where(held, 0.0, where(resting, alone_theta, theta_ddot))
         others: Any = jax.tree.map(jnp.zeros_like, v[2:])  # of time, on the bench
         return (x_ddot, theta_ddot, *others)
 
@@ -127,8 +128,8 @@ class InContact:
             for rate, sticks in zip(v[:2], dry, strict=True)
         )
         if self.half_length is not None:
-            cart = jnp.where((q[0] >= self.half_length) & (v[0] >= 0.0), AT_STOP, cart)
-            cart = jnp.where((q[0] <= -self.half_length) & (v[0] <= 0.0), -AT_STOP, cart)
+            cart = where((q[0] >= self.half_length) & (v[0] >= 0.0), AT_STOP, cart)
+            cart = where((q[0] <= -self.half_length) & (v[0] <= 0.0), -AT_STOP, cart)
         return ContactMode(cart, pole)
 
     def guards(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> tuple[Scalar, ...]:
@@ -154,34 +155,34 @@ class InContact:
         sliding = jnp.abs(cart) == 1
         coupling = self._coupling(self.geometry(q))
         of_cart = guard == 0
-        x_dot = jnp.where(of_cart & sliding, 0.0, x_dot)
-        after = jnp.where(of_cart, jnp.where(sliding, HELD, _LOOSE), cart)
+        x_dot = where(of_cart & sliding, 0.0, x_dot)
+        after = where(of_cart, where(sliding, HELD, _LOOSE), cart)
         number = 1
         if self.free.pivot_coulomb_friction is not None:
             of_pole = guard == 1
             turning = jnp.abs(pole) == 1
             if not self._follows:
                 moved = -coupling * theta_dot / (self.free.moving_mass + self.free.pole_mass)
-                x_dot = x_dot + jnp.where(of_pole & turning & sliding, moved, 0.0)
-            theta_dot = jnp.where(of_pole & turning, 0.0, theta_dot)
-            pole = jnp.where(of_pole, jnp.where(turning, HELD, _LOOSE), pole)
+                x_dot = x_dot + where(of_pole & turning & sliding, moved, 0.0)
+            theta_dot = where(of_pole & turning, 0.0, theta_dot)
+            pole = where(of_pole, where(turning, HELD, _LOOSE), pole)
             number = 2
         hits = guard == number
         if self.half_length is not None:
-            side = jnp.where(x > 0.0, 1, -1)
+            side = where(x > 0.0, 1, -1)
             # Another event in the same step may have turned the cart already.
-            back = jnp.where(side * x_dot > 0.0, -self.restitution * x_dot, x_dot)
+            back = where(side * x_dot > 0.0, -self.restitution * x_dot, x_dot)
             rebounds = jnp.abs(back) >= _SLOWEST_REBOUND
-            x = jnp.where(hits, side * self.half_length, x)
-            x_dot = jnp.where(hits, jnp.where(rebounds, back, 0.0), x_dot)
-            after = jnp.where(hits, jnp.where(rebounds, -side, AT_STOP * side), after)
+            x = where(hits, side * self.half_length, x)
+            x_dot = where(hits, where(rebounds, back, 0.0), x_dot)
+            after = where(hits, where(rebounds, -side, AT_STOP * side), after)
         # What stops the cart acts on the pole too. Dry friction stops what is at rest already, to rounding, unless its
         # event took effect late.
         turn = coupling * (x_dot - v[0]) / self.free.pivot_inertia
-        theta_dot = theta_dot + jnp.where(hits | (of_cart & sliding & (pole != HELD)), turn, 0.0)
+        theta_dot = theta_dot + where(hits | (of_cart & sliding & (pole != HELD)), turn, 0.0)
         if self.free.pivot_coulomb_friction is not None:
             # The impact may turn a held pole, or one that slides the other way.
-            pole = jnp.where(hits, jnp.sign(theta_dot).astype(pole.dtype), pole)
+            pole = where(hits, jnp.sign(theta_dot).astype(pole.dtype), pole)
         return (x, *q[1:]), (x_dot, theta_dot, *v[2:]), ContactMode(after.astype(cart.dtype), pole.astype(cart.dtype))
 
     def release(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> ContactMode:
@@ -194,17 +195,17 @@ class InContact:
         smooth = self.free.loads(geometry, v, u)  # the same in every mode
         static_x, static_theta = self._static()
         loose = mode.pole == _LOOSE
-        _, pole = self._holding(geometry, smooth, mode._replace(pole=jnp.where(loose, HELD, mode.pole)))
-        mode = mode._replace(pole=jnp.where(loose, _direction(pole), mode.pole))
+        _, pole = self._holding(geometry, smooth, mode._replace(pole=where(loose, HELD, mode.pole)))
+        mode = mode._replace(pole=where(loose, _direction(pole), mode.pole))
         for axis in ("cart", "pole", "cart"):
             cart, pole = self._holding(geometry, smooth, mode)
             if axis == "pole":
                 loose = (mode.pole == HELD) & (jnp.abs(pole) > static_theta)
-                mode = mode._replace(pole=jnp.where(loose, _direction(pole), mode.pole))
+                mode = mode._replace(pole=where(loose, _direction(pole), mode.pole))
                 continue
             loose = (mode.cart == _LOOSE) | (mode.cart == HELD) & (jnp.abs(cart) > static_x)
             loose |= (mode.cart == AT_STOP) & (cart < -static_x) | (mode.cart == -AT_STOP) & (cart > static_x)
-            mode = mode._replace(cart=jnp.where(loose, _direction(cart), mode.cart))
+            mode = mode._replace(cart=where(loose, _direction(cart), mode.cart))
         return mode
 
     def during(
@@ -228,7 +229,7 @@ class InContact:
         """Returns force [N] and torque [N m] with the friction of what slides."""
         push, torque = (jnp.asarray(load) for load in smooth)
         if self.free.coulomb_friction is not None:
-            direction = jnp.where(jnp.abs(mode.cart) == 1, mode.cart, 0).astype(push.dtype)
+            direction = where(jnp.abs(mode.cart) == 1, mode.cart, 0).astype(push.dtype)
             push = push - direction * self.free.coulomb_friction
         if self.free.pivot_coulomb_friction is not None:
             torque = torque - mode.pole.astype(torque.dtype) * self.free.pivot_coulomb_friction
@@ -257,15 +258,15 @@ class InContact:
         resting, held = self._resting(mode)
         alone_x, alone_theta = self._one_at_rest(push, torque)
         return (
-            push if self._follows else push + coupling * jnp.where(held, 0.0, alone_theta),
-            torque + coupling * jnp.where(resting, 0.0, alone_x),
+            push if self._follows else push + coupling * where(held, 0.0, alone_theta),
+            torque + coupling * where(resting, 0.0, alone_x),
         )
 
     def _stop(self, q: Pair, mode: ContactMode) -> tuple[Scalar, ...]:
         """Returns the distance to the nearer stop."""
         if self.half_length is None:
             return ()
-        return (jnp.where(jnp.abs(mode.cart) == AT_STOP, _NO_END, self.half_length - jnp.abs(q[0])),)
+        return (where(jnp.abs(mode.cart) == AT_STOP, _NO_END, self.half_length - jnp.abs(q[0])),)
 
 
 def in_contact(plant: Any, half_length: Scalar | None = None, restitution: Scalar = 0.0) -> Any:
@@ -289,10 +290,10 @@ def _end(mode: Int[Array, ""], rate: Scalar | None, force: Scalar, static: Scala
     """
     side = jnp.sign(mode).astype(jnp.asarray(force).dtype)
     speed = _NO_END if rate is None else side * rate
-    press = jnp.where(mode == HELD, -jnp.abs(force), side * force)
-    return jnp.where(jnp.abs(mode) == 1, speed, static + press)
+    press = where(mode == HELD, -jnp.abs(force), side * force)
+    return where(jnp.abs(mode) == 1, speed, static + press)
 
 
 def _direction(force: Scalar) -> Int[Array, ""]:
     """Returns the mode of what slides as a force pushes it."""
-    return jnp.where(force > 0.0, np.int32(1), np.int32(-1))
+    return where(force > 0.0, np.int32(1), np.int32(-1))

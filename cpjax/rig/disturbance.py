@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from cpjax.errors import InputError
 from cpjax.numeric.noise import Word, random_bits, standard_normals
+from cpjax.numeric.selection import where
 from cpjax.plant import AccelerationActuator
 from cpjax.pytree import JaxOrNumpy, Scalar, is_traced, matrix, number, pytree
 
@@ -70,7 +71,7 @@ class RandomPushes:
         a, b = random_bits((key, jnp.asarray(_PUSH)), (run, interval.astype(jnp.uint32)))
         share = (a >> np.uint32(8)).astype(jnp.int32).astype(time.dtype) * 2.0**-24
         begin = interval * self.every + share * (self.every - self.duration)
-        acts = jnp.where(time < self.until, _share(time, dt, begin, self.duration), 0.0)
+        acts = where(time < self.until, _share(time, dt, begin, self.duration), 0.0)
         side_of_cart = 1.0 - 2.0 * (b & np.uint32(1)).astype(jnp.int32).astype(time.dtype)
         side_of_pole = 1.0 - 2.0 * ((b >> np.uint32(1)) & np.uint32(1)).astype(jnp.int32).astype(time.dtype)
         return Forces(acts * side_of_cart * self.cart, acts * side_of_pole * self.pole)

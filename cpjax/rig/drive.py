@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cpjax.numeric.quantisation import quantize
+from cpjax.numeric.selection import where
 from cpjax.pytree import Scalar, number, pytree
 
 
@@ -39,7 +40,7 @@ class Drive:
         """Returns the terminal voltage [V] for a clipped command [V]; its derivative is 0 inside the dead band."""
         if self.voltage_step is not None:
             voltage = quantize(voltage, self.voltage_step, derivative="straight_through")
-        return jnp.where(jnp.abs(voltage) <= self.dead_band, 0.0 * voltage, voltage)
+        return where(jnp.abs(voltage) <= self.dead_band, 0.0 * voltage, voltage)
 
 
 def line_of_decay(ratio: Scalar) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -50,7 +51,7 @@ def line_of_decay(ratio: Scalar) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """
     ratio = jnp.asarray(ratio)
     slow = ratio < 0.03  # the closed forms below cancel
-    some = jnp.where(slow, 1.0, ratio)
+    some = where(slow, 1.0, ratio)
     left = jnp.exp(-some)
     mean = -jnp.expm1(-some) / some
     slope = 12.0 * ((mean - left) / some - 0.5 * mean)
@@ -59,6 +60,6 @@ def line_of_decay(ratio: Scalar) -> tuple[Float[Array, ""], Float[Array, ""]]:
         first = 1.0 - ratio * share * first
     for share in (3 / 20, 5 / 28, 2 / 9, 3 / 10, 1 / 2):
         terms = 1.0 - ratio * share * terms
-    mean = jnp.where(slow, first, mean)
-    slope = jnp.where(slow, -ratio * terms, slope)
+    mean = where(slow, first, mean)
+    slope = where(slow, -ratio * terms, slope)
     return mean - 0.5 * slope, slope

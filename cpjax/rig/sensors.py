@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from cpjax.numeric.angles import wrap_angle
 from cpjax.numeric.noise import Word, standard_normals
 from cpjax.numeric.quantisation import quantize
+from cpjax.numeric.selection import where
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, is_traced, number, pytree
 
@@ -80,9 +81,9 @@ class Potentiometers:
     ) -> Position:
         """Returns the measurement of a state; arguments as of `Encoders.measure`."""
         from_gap = wrap_angle(state.theta - self.dead_centre)
-        end = jnp.where(from_gap < 0.0, -0.5, 0.5) * self.dead_angle
+        end = where(from_gap < 0.0, -0.5, 0.5) * self.dead_angle
         in_gap = jnp.abs(from_gap) < 0.5 * self.dead_angle
-        x, theta = state.x, state.theta + jnp.where(in_gap, end - from_gap, 0.0) + self.theta_offset
+        x, theta = state.x, state.theta + where(in_gap, end - from_gap, 0.0) + self.theta_offset
         if noisy:
             of_x, of_theta = standard_normals(key, counter, jnp.asarray(state.x).dtype)
             x, theta = x + self.x_noise * of_x, theta + self.theta_noise * of_theta

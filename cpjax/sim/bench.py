@@ -14,6 +14,7 @@ from cpjax.checks import call, pair
 from cpjax.controllers.protocol import as_sampled
 from cpjax.errors import InputError
 from cpjax.numeric.noise import standard_normals
+from cpjax.numeric.selection import where
 from cpjax.plant.state import State
 from cpjax.pytree import Scalar, is_traced
 from cpjax.rig import Position, Rig
@@ -79,7 +80,7 @@ class Bench:
         if memory.held is not None:
             due = memory.step % self.divider == 0
             inner, command = jax.tree.map(
-                lambda new, old: jnp.where(due, new, old), (inner, command), (memory.inner, memory.held)
+                lambda new, old: where(due, new, old), (inner, command), (memory.inner, memory.held)
             )
         held = None if memory.held is None else command
         if self.drive_noise is not None:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from cpjax.backend.single_kernel import outline
 from cpjax.checks import call, integer, real
 from cpjax.controllers.protocol import SmoothController, demand
+from cpjax.numeric.selection import where
 from cpjax.sim import plants
 from cpjax.sim.plants import Plant, Tree
 from cpjax.sim.stepper import dtype_of
@@ -55,7 +56,7 @@ class ContinuousLoop(NamedTuple):
         margin = real("controller.margin", call("controller", self.controller, "margin", state, mode.law))
         u = self._applied(demanded, mode.clip)
         guards = (
-            jnp.where(mode.clip == 0, 1.0 - jnp.abs(relative), jnp.where(mode.clip > 0, relative, -relative) - 1.0),
+            where(mode.clip == 0, 1.0 - jnp.abs(relative), where(mode.clip > 0, relative, -relative) - 1.0),
             margin.astype(dtype_of(state)),
             *plant_guards(self.plant, q, v, u, mode.plant),
         )
@@ -63,19 +64,19 @@ class ContinuousLoop(NamedTuple):
 
     def jump(self, q: Tree, v: Tree, mode: Mode, guard: Int[Array, ""]) -> tuple[Tree, Tree, Mode]:
         successor = integer("controller.successor", call("controller", self.controller, "successor", mode.law))
-        law = jnp.where(guard == GATE, successor, mode.law)
+        law = where(guard == GATE, successor, mode.law)
         of_plant, own = mode.plant, guard > GATE
         if plants.has_events(self.plant):
             after = outline(plants.jump)(self.plant, q, v, mode.plant, guard - (GATE + 1))
-            q, v, of_plant = jax.tree.map(lambda new, old: jnp.where(own, new, old), after, (q, v, mode.plant))
+            q, v, of_plant = jax.tree.map(lambda new, old: where(own, new, old), after, (q, v, mode.plant))
         state = plants.state_of(self.plant, q, v)
         demanded = self._demand(state, law)
         now = self._clip(demanded)
         # On the limit itself the demand's excess is rounding error and is ignored. A demand that has jumped past the
         # other limit is clipped there.
-        inside = jnp.where(now == -mode.clip, now, 0)
-        clip = jnp.where(mode.clip == 0, jnp.where(demanded > 0.0, 1, -1), inside)
-        clip = jnp.where((guard == GATE) | own, now, clip).astype(mode.clip.dtype)
+        inside = where(now == -mode.clip, now, 0)
+        clip = where(mode.clip == 0, where(demanded > 0.0, 1, -1), inside)
+        clip = where((guard == GATE) | own, now, clip).astype(mode.clip.dtype)
         # A jump of the plant's state may have moved the demand beyond a limit, and one of the demand may release it.
         if plants.has_events(self.plant):
             of_plant = outline(plants.release)(self.plant, q, v, self._applied(demanded, clip), of_plant)
@@ -97,7 +98,7 @@ class ContinuousLoop(NamedTuple):
     def _applied(self, demanded: Float[Array, ""], clip: Int[Array, ""]) -> Float[Array, ""]:
         """Returns the applied voltage, with the demand clipped as `clip` says."""
         limit = self.plant.input_limit
-        return jnp.where(clip == 0, demanded, jnp.where(clip > 0, limit, -limit))
+        return where(clip == 0, demanded, where(clip > 0, limit, -limit))
 
     def _demand(self, state: Tree, law: Int[Array, ""]) -> Float[Array, ""]:
         return demand(self.controller, state, law)

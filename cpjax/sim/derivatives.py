@@ -48,6 +48,7 @@ from cpjax.controllers.protocol import (
     start_memory,
 )
 from cpjax.errors import DerivativeWarning, InputError
+from cpjax.numeric.selection import where
 from cpjax.pytree import Scalar, part, pytree
 
 _NEEDS = ("start_mode", "next_mode", "mode_voltage", "margin", "successor")
@@ -124,14 +125,14 @@ def shift_of(memory: Any) -> Float[Array, ""]:
 def _moved_crossing(before: Float[Array, ""], after: Float[Array, ""], crossed: Bool[Array, ""]) -> Float[Array, ""]:
     """Returns 0 with, where `crossed`, the derivative of the crossing's position in the period between the two margins,
     `before / (before - after)`."""
-    return jnp.where(crossed, jnp.zeros_like(before), jnp.zeros_like(before))
+    return where(crossed, jnp.zeros_like(before), jnp.zeros_like(before))
 
 
 @_moved_crossing.defjvp
 def _moved_crossing_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     before, after, crossed = primals
     d_before, d_after, _ = tangents
-    over = jnp.where(crossed, 1.0 / jnp.where(crossed, before - after, 1.0) ** 2, 0.0)
+    over = where(crossed, 1.0 / where(crossed, before - after, 1.0) ** 2, 0.0)
     return _moved_crossing(*primals), over * (before * d_after - after * d_before)
 
 
@@ -143,7 +144,7 @@ def shifted(new: Any, old: Any, shift: Float[Array, ""]) -> Any:
       new, old: trees of one structure.
     """
     # Written with `where` so that under vmap the value is batched wherever its derivative is.
-    return jax.tree.map(lambda a: jnp.where(shift == 0.0, a, a), new)
+    return jax.tree.map(lambda a: where(shift == 0.0, a, a), new)
 
 
 @shifted.defjvp
@@ -155,7 +156,7 @@ def _shifted_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
         if not jnp.issubdtype(jnp.asarray(new).dtype, jnp.floating):
             return tangent
         jump = _once(old - new)  # NaN for two infinities, such as a settling time that is not known yet
-        return tangent + jnp.where(jnp.isfinite(jump), jump, 0.0) * d_shift
+        return tangent + where(jnp.isfinite(jump), jump, 0.0) * d_shift
 
     return shifted(new, old, shift), jax.tree.map(moved, new, old, d_new)
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from cpjax.backend.single_kernel import outline
+from cpjax.numeric.selection import where
 from cpjax.pytree import Scalar
 from cpjax.sim import plants
 from cpjax.sim.flags import STOPPED, Flag
@@ -44,13 +45,13 @@ def is_stopped(flag: Int[Array, ""]) -> Bool[Array, ""]:
 
 def safe(going: Bool[Array, ""], tree: Any) -> Any:
     """Returns the tree where the run continues, and zeros where it does not."""
-    return jax.tree.map(lambda value: jnp.where(going, value, jnp.zeros((), jnp.asarray(value).dtype)), tree)
+    return jax.tree.map(lambda value: where(going, value, jnp.zeros((), jnp.asarray(value).dtype)), tree)
 
 
 def verdict(plant: Plant, after: PlantState, outlook: Outlook) -> tuple[Bool[Array, ""], Int[Array, ""]]:
     """Returns whether the state after a step is within the limits, and the flag for a step that is not."""
     within, finite = outline(_judged)(after, outlook.ahead, plant.limits)
-    return within, jnp.where(finite, np.int32(Flag.RUNAWAY), np.int32(Flag.NON_FINITE))
+    return within, where(finite, np.int32(Flag.RUNAWAY), np.int32(Flag.NON_FINITE))
 
 
 def _judged(after: PlantState, ahead: Tree, limits: PlantState) -> tuple[Bool[Array, ""], Bool[Array, ""]]:

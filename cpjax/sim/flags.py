@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from cpjax.numeric.selection import where
 from cpjax.pytree import is_number
 
 
@@ -47,9 +48,9 @@ def describe(flag: Int[ArrayLike, ""]) -> str:
 def nonfinite_flag(tree: Any) -> Int[Array, ""]:
     """Returns NON_FINITE if a number of the tree is NaN, else 0; int32."""
     leaves = jnp.stack([jnp.any(jnp.isnan(leaf)) for leaf in jax.tree.leaves(tree) if is_number(leaf)])
-    return jnp.where(jnp.any(leaves), int(Flag.NON_FINITE), 0).astype(jnp.int32)
+    return where(jnp.any(leaves), int(Flag.NON_FINITE), 0).astype(jnp.int32)
 
 
 def nonfinite_input(voltage: Float[Array, ""]) -> Int[Array, ""]:
     """Returns the flag of a run whose applied input is not finite, else 0."""
-    return jnp.where(jnp.isfinite(voltage), np.int32(0), np.int32(Flag.NON_FINITE))
+    return where(jnp.isfinite(voltage), np.int32(0), np.int32(Flag.NON_FINITE))

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 
 from cpjax.backend.single_kernel import outline
 from cpjax.numeric.roots import newton_correction
+from cpjax.numeric.selection import where
 from cpjax.sim import plants
 from cpjax.sim.integrators import Acceleration, Integrator
 from cpjax.sim.plants import Plant, Tree
@@ -60,7 +61,7 @@ def step_with_event(
     search = lax.stop_gradient((before, slopes_before, after, slopes_after, dt))
     falls, number, share = outline(first_crossing)(*search, _NOT, _NOT, _NOT, _NONE, search[-1])
     start, end = pick(before, number), pick(after, number)
-    share = jnp.where(start > 0.0, share, 0.0)  # a guard that is below zero already ends its mode now
+    share = where(start > 0.0, share, 0.0)  # a guard that is below zero already ends its mode now
 
     def at(share: Float[Array, ""]) -> _Motion:
         return _interpolated(q, v, first, v_end, last, dt, share)
@@ -70,8 +71,8 @@ def step_with_event(
     steepness = (jnp.abs(start) + jnp.abs(end)) / dt
     correction = newton_correction(pick(near, number), pick(slopes, number), steepness) / dt
     sought = falls & (start > 0.0)
-    share = share + jnp.where(sought, jnp.clip(correction, -share, 1.0 - share), 0.0)
-    share = jnp.where(falls, share, 1.0)
+    share = share + where(sought, jnp.clip(correction, -share, 1.0 - share), 0.0)
+    share = where(falls, share, 1.0)
     q_there, v_there = at(share)
     q_new, v_new, mode_new = plants.jump(plant, q_there, v_there, mode, number)
     mode_new = plants.release(plant, q_new, v_new, u, mode_new)
@@ -110,4 +111,4 @@ def _interpolated(q: Tree, v: Tree, first: Tree, v_end: Tree, last: Tree, dt: An
 
 
 def _chosen(condition: Any, new: Tree, old: Tree) -> Tree:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
+    return jax.tree.map(lambda x, y: where(condition, x, y), new, old)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cpjax.backend.single_kernel import outline, single_kernel
 from cpjax.errors import InputError
+from cpjax.numeric.selection import where
 from cpjax.sim import failures, plants
 from cpjax.sim.closed_loop import GATE, GATE_CROSSING, LIMIT, ContinuousLoop, HeldLoop, HeldMode, System
 from cpjax.sim.control import Control, start_control, update_control
@@ -105,7 +106,7 @@ def _run(
         after = outline(update_metric)(metric, memory, sample)
         updated = after, sample.voltage, sample.mode
         kept = memory, loop.voltage, loop.mode
-        memory, voltage, mode = jax.tree.map(lambda new, old: jnp.where(reached, new, old), updated, kept)
+        memory, voltage, mode = jax.tree.map(lambda new, old: where(reached, new, old), updated, kept)
         loop = loop._replace(voltage=voltage, mode=mode)
         return (loop, memory), (None if settings.save_every is None else (pack(sample, plant), loop.motion.grid_index))
 
@@ -126,21 +127,21 @@ def _sample(plant: Plant, loop: _Loop, before: Motion, dt: Step) -> Sample:
     state = plants.state_of(plant, motion.q, motion.v)
     crossing = before.guard + GATE_CROSSING + (1 if held else -GATE)
     if not held:
-        crossing = jnp.where(before.guard == LIMIT, jnp.where(motion.current.output > 0.0, 1, 2), crossing)
+        crossing = where(before.guard == LIMIT, where(motion.current.output > 0.0, 1, 2), crossing)
     return Sample(
         time=motion.grid_index.astype(dt.dtype) * dt + motion.offset,
         elapsed=jnp.asarray(motion.elapsed),
         state=state,
         voltage=motion.current.output,
         voltage_since=loop.voltage,
-        voltage_until=None if held else jnp.where(landed, before.current.output, motion.current.output),
+        voltage_until=None if held else where(landed, before.current.output, motion.current.output),
         mode=_law(motion, loop.control),
         mode_before=loop.mode,
         outputs=plants.outputs(plant, state, motion.current.acceleration, motion.current.output),
         plant_mode=motion.mode.plant,
         flag=loop.flag,
-        crossing=jnp.where(landed, crossing, 0),
-        crossing_speed=jnp.where(landed, -pick(before.slopes, before.guard), 0.0),
+        crossing=where(landed, crossing, 0),
+        crossing_speed=where(landed, -pick(before.slopes, before.guard), 0.0),
     )
 
 
@@ -159,18 +160,18 @@ def _advance(
     after, reached = iterate(system, integrator, failures.safe(going, motion), dt)
     within, lost = failures.verdict(plant, plants.state_of(plant, after.q, after.v), outlook)
     good = going & within & (left > settings.steps - after.grid_index)
-    reason = jnp.where(going & within, np.int32(Flag.OVERFLOW), lost)
-    chatter = jnp.where(good & (after.crossings >= CHATTER_LENGTH), np.int32(Flag.CHATTERING), np.int32(0))
-    flag = loop.flag | jnp.where(stopped | ended | good, np.int32(0), reason) | chatter
+    reason = where(going & within, np.int32(Flag.OVERFLOW), lost)
+    chatter = where(good & (after.crossings >= CHATTER_LENGTH), np.int32(Flag.CHATTERING), np.int32(0))
+    flag = loop.flag | where(stopped | ended | good, np.int32(0), reason) | chatter
     # A held run passes one grid point per iteration.
     on_hold = motion._replace(
         grid_index=motion.grid_index + (~ended).astype(motion.grid_index.dtype),
         offset=jnp.zeros_like(motion.offset),
-        elapsed=jnp.where(ended, motion.elapsed, 0.0),
+        elapsed=where(ended, motion.elapsed, 0.0),
         phase=jnp.full_like(motion.phase, RUN),
     )
     before = motion.grid_index
-    motion = jax.tree.map(lambda new, old: jnp.where(good, new, old), after, on_hold)
+    motion = jax.tree.map(lambda new, old: where(good, new, old), after, on_hold)
     loop = loop._replace(motion=motion, flag=flag)
     if held:
         instant = (motion.grid_index != before) & (motion.grid_index % settings.steps_per_control == 0)
@@ -186,13 +187,13 @@ def _control(
     assert loop.control is not None
     state = plants.state_of(plant, motion.q, motion.v)
     control = update_control(plant, controller, loop.control, state, settings)
-    changes = jnp.where(control.mode != loop.control.mode, loop.changes + 1, 0)
+    changes = where(control.mode != loop.control.mode, loop.changes + 1, 0)
     released = plants.release(plant, motion.q, motion.v, control.applied, motion.mode.plant)
     mode = motion.mode._replace(u=control.applied, plant=released)
     current, slopes, _ = observe(system, motion.q, motion.v, mode)
     new = (control, changes, motion._replace(mode=mode, current=current, slopes=slopes))
     control, changes, motion = jax.tree.map(
-        lambda x, y: jnp.where(instant, x, y), new, (loop.control, loop.changes, motion)
+        lambda x, y: where(instant, x, y), new, (loop.control, loop.changes, motion)
     )
-    chatter = jnp.where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
+    chatter = where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
     return loop._replace(motion=motion, control=control, changes=changes, flag=loop.flag | chatter)

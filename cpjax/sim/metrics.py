@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.errors import InputError
 from cpjax.numeric.angles import wrap_angle
+from cpjax.numeric.selection import where
 from cpjax.pytree import Scalar, number, pytree
 from cpjax.sim.flags import STOPPED
 from cpjax.sim.plants import PlantState, Tree
@@ -220,7 +221,7 @@ class ProtocolMetrics:
             variation = variation + jnp.abs(last - first)
             effort = 0.5 * (effort + sample.elapsed * last * last)
         return _State(
-            entered=jnp.where(inside, jnp.minimum(sample.time, state.entered), math.inf),
+            entered=where(inside, jnp.minimum(sample.time, state.entered), math.inf),
             cart_travel=jnp.maximum(state.cart_travel, travel),
             effort=state.effort + effort,
             voltage_variation=state.voltage_variation + variation,
@@ -231,7 +232,7 @@ class ProtocolMetrics:
 
     def finalize(self, state: _State, last: Sample) -> Metrics:
         stopped = (last.flag & STOPPED) != 0
-        settling_time = jnp.where(stopped, math.inf, state.entered)
+        settling_time = where(stopped, math.inf, state.entered)
         rounding = 64.0 * float(np.finfo(last.time.dtype).eps) * last.time
         in_time = settling_time <= last.time - self.hold + rounding
         return Metrics(

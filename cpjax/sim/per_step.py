@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from cpjax.backend import runtime
 from cpjax.backend.single_kernel import outline, single_kernel
 from cpjax.checks import arrays, call, like
+from cpjax.numeric.selection import where
 from cpjax.pytree import cast
 from cpjax.sim import failures, plants
 from cpjax.sim.control import Control, start_control, update_control
@@ -66,7 +67,7 @@ def simulate(
     """Simulates one initial state; see `cpjax.sim.rollout.simulate`."""
     control = start_control(plant, controller, start, settings)
     flag = nonfinite_flag((start, plant, controller))
-    flag = jnp.where(flag != 0, np.int32(NEEDS_RECOMPUTE), flag) if settings.fast_path else flag
+    flag = where(flag != 0, np.int32(NEEDS_RECOMPUTE), flag) if settings.fast_path else flag
     plant_mode = plants.start_mode(plant, *plants.coordinates(plant, start))
     loop = _Loop(start, control, flag, jnp.zeros_like(flag), plant_mode, plants.start_drive(plant, start))
     _, first, _ = _observe(plant, controller, loop, jnp.asarray(0), dt, settings)
@@ -79,7 +80,7 @@ def simulate(
     (loop, memory), samples = run(carry, plant, controller, metric, dt)
     after, last, instant = _observe(plant, controller, loop, jnp.asarray(settings.steps), dt, settings)
     broken = nonfinite_input(last.voltage)  # of the last instant, after which no step looks at it
-    broken = jnp.where(broken != 0, np.int32(NEEDS_RECOMPUTE), broken) if settings.fast_path else broken
+    broken = where(broken != 0, np.int32(NEEDS_RECOMPUTE), broken) if settings.fast_path else broken
     last = last._replace(flag=last.flag | broken)
     clean = last._replace(flag=last.flag & ~NEEDS_RECOMPUTE)
     now = instant.plant
@@ -139,13 +140,13 @@ def _fold(
     instant = index % settings.steps_per_control == 0 if settings.steps_per_control > 1 else np.bool_(True)
     since = sample._replace(
         voltage_since=before.blend.held,
-        voltage=jnp.where(instant, sample.voltage, now.blend.held),
-        mode_before=jnp.where(instant, before.blend.mode, now.blend.mode),
-        mode=jnp.where(instant, sample.mode, now.blend.mode),
+        voltage=where(instant, sample.voltage, now.blend.held),
+        mode_before=where(instant, before.blend.mode, now.blend.mode),
+        mode=where(instant, sample.mode, now.blend.mode),
     )
     result = shifted(new, update(metric, memory, _completed(plant, since)), before.blend.shift)
     begun = sample._replace(voltage=now.blend.held, mode=now.blend.mode)
-    return shifted(result, update(metric, memory, _completed(plant, begun)), jnp.where(instant, now.blend.shift, 0.0))
+    return shifted(result, update(metric, memory, _completed(plant, begun)), where(instant, now.blend.shift, 0.0))
 
 
 def sees_the_voltage(metric: Metric, memory: MetricState, sample: Sample) -> bool:
@@ -202,14 +203,14 @@ def _observe(
     state = loop.state
     control = update_control(plant, controller, loop.control, state, settings)
     before = loop.control.mode
-    changes = jnp.where(control.mode != before, loop.changes + 1, 0)
+    changes = where(control.mode != before, loop.changes + 1, 0)
     until = applied_voltage(plant, controller, state, before) if settings.clock == "continuous" else None
     if settings.steps_per_control > 1:
         instant = index % settings.steps_per_control == 0
         new, old = (control, changes), (loop.control, loop.changes)
-        control, changes = jax.tree.map(lambda x, y: jnp.where(instant, x, y), new, old)
+        control, changes = jax.tree.map(lambda x, y: where(instant, x, y), new, old)
     voltage, mode = control.voltage, control.mode
-    flag = loop.flag | jnp.where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
+    flag = loop.flag | where(changes >= CHATTER_LENGTH, np.int32(Flag.CHATTERING), np.int32(0))
     # The fast path never stops a run; it marks it for recomputation.
     going = jnp.asarray(True) if settings.fast_path else ~failures.is_stopped(flag)
     plant, drive = plants.during(plant, loop.drive, index, dt, state, control.applied)
@@ -219,7 +220,7 @@ def _observe(
     accelerations = outline(plants.accelerations)(plant, geometry, v, voltage, plant_mode)
     sample = Sample(
         time=index.astype(dt.dtype) * dt,
-        elapsed=jnp.where((index > 0) & going, dt, 0.0),
+        elapsed=where((index > 0) & going, dt, 0.0),
         state=state,
         voltage=voltage,
         voltage_since=loop.control.voltage,
@@ -251,7 +252,7 @@ def _advance(controller: Any, loop: _Loop, instant: _Instant, dt: Step, settings
         else:
             after, near = step_held_incremental(plant, method, state, geometry, loop.control.voltage, dt, first)
         right = outlook.possible & near & plants.within(after, plant.limits)
-        flag = loop.flag | jnp.where(right, np.int32(0), np.int32(NEEDS_RECOMPUTE))
+        flag = loop.flag | where(right, np.int32(0), np.int32(NEEDS_RECOMPUTE))
         return loop._replace(state=after, flag=flag, plant_mode=plant_mode)
     stopped = failures.is_stopped(loop.flag)
     going = ~stopped & outlook.possible
@@ -266,10 +267,10 @@ def _advance(controller: Any, loop: _Loop, instant: _Instant, dt: Step, settings
     within, reason = failures.verdict(plant, after, outlook)
     good = going & within
     state, plant_mode = jax.tree.map(
-        lambda old, new: jnp.where(good, new, old), (state, loop.plant_mode), (after, plant_mode)
+        lambda old, new: where(good, new, old), (state, loop.plant_mode), (after, plant_mode)
     )
     return loop._replace(
-        state=state, plant_mode=plant_mode, flag=loop.flag | jnp.where(stopped | good, np.int32(0), reason)
+        state=state, plant_mode=plant_mode, flag=loop.flag | where(stopped | good, np.int32(0), reason)
     )
 
 

@@ -32,6 +32,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from cpjax.backend.single_kernel import outline
 from cpjax.numeric.roots import crossing_fraction, newton_correction
+from cpjax.numeric.selection import where
 from cpjax.pytree import Scalar
 from cpjax.sim.integrators import Integrator, Step
 
@@ -126,7 +127,7 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) ->
     room = dt * float(np.finfo(dt.dtype).eps) ** 0.5
     far = (jnp.abs(correction) > 0.05 * motion.bracket + room) | (step + correction < -room)
     missed = locating & far & (motion.bracket > room)
-    correction = jnp.where(far, 0.0, correction)
+    correction = where(far, 0.0, correction)
     corrected = step + correction
 
     # What follows only searches for the crossing: Newton's corrections carry its derivative, steps that are tried have
@@ -148,11 +149,11 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) ->
     )
     q, v = _where(land, (new_q, new_v), (q, v))
     # The last correction is zero to rounding, and carries the second derivative of the crossing's time.
-    trial = trial._replace(output=_shifted(trial.output, drift, jnp.where(land, correction, 0.0)))
+    trial = trial._replace(output=_shifted(trial.output, drift, where(land, correction, 0.0)))
     moved = land | reached
-    offset = jnp.where(land | short, motion.offset + corrected, jnp.where(at_grid, 0.0, motion.offset))
-    step_next = jnp.where(fell, lax.stop_gradient(fraction * step), jnp.where(refine, corrected, dt - offset))
-    phase_next = jnp.where(fell, LOCATE, jnp.where(refine, phase + 1, jnp.where(land, LANDED, RUN)))
+    offset = where(land | short, motion.offset + corrected, where(at_grid, 0.0, motion.offset))
+    step_next = where(fell, lax.stop_gradient(fraction * step), where(refine, corrected, dt - offset))
+    phase_next = where(fell, LOCATE, where(refine, phase + 1, where(land, LANDED, RUN)))
     return (
         Motion(
             q=_where(moved, q, motion.q),
@@ -162,12 +163,12 @@ def iterate(system: System, integrator: Integrator, motion: Motion, dt: Step) ->
             slopes=_where(moved, slopes, motion.slopes),
             grid_index=motion.grid_index + at_grid.astype(motion.grid_index.dtype),
             offset=offset,
-            step=jnp.where(land, 0.0, step_next),
-            elapsed=jnp.where(land | short, corrected, jnp.where(at_grid, step, motion.elapsed)),
+            step=where(land, 0.0, step_next),
+            elapsed=where(land | short, corrected, where(at_grid, step, motion.elapsed)),
             phase=phase_next.astype(phase.dtype),
-            guard=jnp.where(fell, first, motion.guard),
-            bracket=jnp.where(fell, lax.stop_gradient(step), motion.bracket),
-            crossings=jnp.where(at_grid, 0, motion.crossings + land.astype(motion.crossings.dtype)),
+            guard=where(fell, first, motion.guard),
+            bracket=where(fell, lax.stop_gradient(step), motion.bracket),
+            crossings=where(at_grid, 0, motion.crossings + land.astype(motion.crossings.dtype)),
         ),
         reached,
     )
@@ -197,14 +198,14 @@ def first_crossing(
         this = locating & (sought == number)
         fallen = (other < 0.0) & (step > 0.0) & ~landed & (~this | missed)
         above = jnp.maximum(one, 0.0)
-        secant = jnp.where(fallen, above / jnp.where(fallen, above - other, 1.0), jnp.inf)
-        secant = jnp.where(locating & ~this & (secant > 1.0 - room / dt), jnp.inf, secant)
-        first = jnp.where(secant < soonest, number, first).astype(sought.dtype)
+        secant = where(fallen, above / where(fallen, above - other, 1.0), jnp.inf)
+        secant = where(locating & ~this & (secant > 1.0 - room / dt), jnp.inf, secant)
+        first = where(secant < soonest, number, first).astype(sought.dtype)
         soonest = jnp.minimum(secant, soonest)
     fraction = crossing_fraction(
         pick(before, first), step * pick(slopes_before, first), pick(after, first), step * pick(slopes_after, first)
     )
-    return soonest < jnp.inf, first, jnp.where(missed, 0.5, fraction)
+    return soonest < jnp.inf, first, where(missed, 0.5, fraction)
 
 
 def observe(system: System, q: Tree, v: Tree, mode: Tree) -> tuple[Observation, Guards, list[Float[Array, "..."]]]:
@@ -236,9 +237,9 @@ def pick(values: Guards, number: Int[Array, ""]) -> Float[Array, ""]:
     """Returns values[number] without a gather, as under `vmap` each value is an array of its own."""
     picked = jnp.asarray(values[0])
     for k, value in enumerate(values[1:], start=1):
-        picked = jnp.where(number == k, value, picked)
+        picked = where(number == k, value, picked)
     return picked
 
 
 def _where(condition: Bool[Array, ""], new: Tree, old: Tree) -> Tree:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
+    return jax.tree.map(lambda x, y: where(condition, x, y), new, old)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
+from cpjax.numeric.selection import where
 from cpjax.pytree import part, pytree
 from cpjax.sim.closed_loop import GATE_CROSSING
 from cpjax.sim.metrics import Metric, MetricState, Sample, finalize
@@ -62,14 +63,14 @@ class HorizonRecorder:
         objective = self.objective.update(state.objective, sample)
         at_gate = sample.crossing == GATE_CROSSING
         crossings = state.crossings + at_gate.astype(jnp.int32)
-        speed = jnp.where(at_gate, jnp.minimum(state.speed, sample.crossing_speed), state.speed)
+        speed = where(at_gate, jnp.minimum(state.speed, sample.crossing_speed), state.speed)
         step = jnp.floor(sample.time / self.dt).astype(jnp.uint32)
         mixed = (state.path + sample.crossing.astype(jnp.uint32)) * jnp.uint32(2654435761) + step
-        path = jnp.where(sample.crossing > 0, mixed, state.path)
+        path = where(sample.crossing > 0, mixed, state.path)
         now = Probe(finalize(self.objective, objective, sample), sample.state.vector(), crossings, speed, path)
         within = (sample.time <= self.horizons) & (sample.crossing == 0)  # horizons are grid points
         probe = jax.tree.map(
-            lambda new, old: jnp.where(within.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), now, state.probe
+            lambda new, old: where(within.reshape((-1,) + (1,) * (old.ndim - 1)), new, old), now, state.probe
         )
         return _State(objective, crossings, speed, path, probe)
 

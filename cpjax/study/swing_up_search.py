@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from cpjax.backend.trigonometry import sin_cos
 from cpjax.errors import InputError
+from cpjax.numeric.selection import where
 from cpjax.plant import CartPole, linearize
 from cpjax.plant.state import State
 from cpjax.pytree import Scalars, number, part, pytree
@@ -85,8 +86,8 @@ class Energy:
         travel = jnp.maximum(state.travel, jnp.abs(sample.state.x))
         return Climb(
             jnp.maximum(state.share, share),
-            jnp.where(before & (share >= 1.0), sample.time, state.time),
-            jnp.where(before, travel, state.travel),
+            where(before & (share >= 1.0), sample.time, state.time),
+            where(before, travel, state.travel),
         )
 
     def finalize(self, state: Climb, last: Sample) -> Climb:

@@ -10,6 +10,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float
 
+from cpjax.numeric.selection import where
+
 OptimiserState: TypeAlias = Any
 """State of an optax optimiser: a pytree of arrays."""
 
@@ -31,7 +33,7 @@ def step(
     with jax.numpy_dtype_promotion("standard"):  # optax's own arithmetic mixes dtypes
         change, state = optimiser.update(slope, state)
         moved = optax.apply_updates(vectors, change)
-    return jnp.where(jnp.isfinite(moved), moved, vectors), state
+    return where(jnp.isfinite(moved), moved, vectors), state
 
 
 def clip_factors(
@@ -45,7 +47,7 @@ def clip_factors(
       clip: largest norm, relative to the median [1].
     """
     norms = jnp.sqrt(jnp.sum(slopes * slopes, axis=1))
-    median = jnp.nan_to_num(jnp.nanmedian(jnp.where(sound, norms, jnp.nan)))
+    median = jnp.nan_to_num(jnp.nanmedian(where(sound, norms, jnp.nan)))
     tiny = float(np.finfo(norms.dtype).tiny)
     return jnp.minimum(1.0, clip * median / jnp.maximum(norms, tiny))
 

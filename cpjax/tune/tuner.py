@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Shaped
 
 from cpjax import files
 from cpjax.controllers import Hybrid, StateFeedback
+from cpjax.numeric.selection import where
 from cpjax.plant import CartPole, linearize
 from cpjax.plant.initial_states import sample_starts
 from cpjax.plant.state import State
@@ -238,13 +239,13 @@ class _Tuner:
 
         values, slopes = jax.vmap(functools.partial(jax.value_and_grad(objective), vector))(starts, plants)
         sound = jnp.all(jnp.isfinite(slopes), axis=1) & jnp.isfinite(values)
-        slopes = jnp.where(sound[:, None], slopes, 0.0)
+        slopes = where(sound[:, None], slopes, 0.0)
         clip_factors = descent.clip_factors(slopes, sound, plan.clip)
-        worst = jnp.max(jnp.where(sound, values, -jnp.inf))
-        values = jnp.where(sound, values, worst)
+        worst = jnp.max(where(sound, values, -jnp.inf))
+        values = where(sound, values, worst)
         loss, shares = jax.value_and_grad(plan.aggregated)(values)
         slope = jnp.sum((shares * clip_factors)[:, None] * slopes, axis=0) + jax.grad(self._fast_pole_penalty)(vector)
-        return loss, jnp.where(jnp.isfinite(slope), slope, 0.0)  # a NaN would stay in Adam's moments
+        return loss, where(jnp.isfinite(slope), slope, 0.0)  # a NaN would stay in Adam's moments
 
     def _fast_pole_penalty(self, vector: Vector) -> Float[Array, ""]:
         """Returns a penalty on closed-loop poles faster than 90 % of `pole_limit`."""

@@ -9,11 +9,9 @@ import argparse
 import json
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -90,21 +88,30 @@ def cpjax_gradient(task: Task, reverse: bool = True, checkpoint: Any = "segments
     return run
 
 
-def c_roofline(task: Task, one: bool = False) -> Run:
+def c_roofline(task: Task) -> Run:
     """By hand in C: see roofline.c."""
+    import jax
     import roofline
 
+    import cpjax
+
     plant, controller = problem()
-    library = roofline.build(Path(tempfile.mkdtemp()), task.dtype, one)
-    threads = 1 if one else task.cores
-    return lambda starts, steps: roofline.run(library, plant, controller, starts, steps, DT, threads).cart_travel
+    trial = cpjax.sample_starts("hanging", 1 if task.starts == 1 else 4096, seed=task.seed)
+    trial = jax.tree.map(lambda column: np.asarray(column, task.dtype), trial)
+    library, form = roofline.build(task.dtype, plant, controller, trial, task.cores)
+
+    def run(starts: Any, steps: int) -> Any:
+        return roofline.run(library, plant, controller, starts, steps, DT, task.cores).cart_travel
+
+    run.form = form.words  # type: ignore[attr-defined]  # a function may have attributes
+    return run
 
 
 LONG_STEPS: dict[str, Any] = {"dt": 0.01, "clock": "continuous", "switching": "located"}
 
 CONTENDERS: dict[str, tuple[Callable[[Task], Run], str]] = {
     "C": (c_roofline, "by hand in C"),
-    "C, one start": (partial(c_roofline, one=True), "by hand in C, compiled for one start"),
+    "C, one start": (c_roofline, "by hand in C, compiled for one start"),
     "cpjax": (cpjax_sweep, "metrics"),
     "cpjax, no options": (cpjax_sweep, "metrics, on as many devices but without options of the compiler"),
     "cpjax, every 10th sample": (partial(cpjax_sweep, save_every=10), "trajectories"),
@@ -175,6 +182,7 @@ def measure(name: str, task: Task) -> dict[str, Any]:
         **task._asdict(),
         "steps_per_second": task.starts * task.steps / min(seconds),
         "seconds": min(seconds),
+        "form": getattr(run, "form", ""),
         "compile_s": max(0.0, first - min(seconds)),
         "peak_MiB": peak,
         "temporary_MiB": None if temporary is None else temporary / 2**20,

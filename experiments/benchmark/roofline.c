@@ -3,32 +3,44 @@
    Plant, law, clock, integrator, metrics and flags are those of cpjax: classical Runge-Kutta with the position rows
    eliminated, control held over a step, energy swing-up with a kick, state feedback, a gate in angle and rate, the
    protocol's metrics. One sine and cosine of full accuracy (2 ulp) a step; the three later stage angles by small
-   rotations, or in full where a lane of the block turns too fast for them. A block of LANES starts stays in the first
-   cache for the whole run, and is worked on a vector at a time (GCC's and Clang's vector extensions).
+   rotations, or in full where a start turns too fast for them. A block of LANES starts stays in the first cache for
+   the whole run, and is worked on a vector of BYTES at a time (GCC's and Clang's vector extensions). In two
+   formulations: all vectors of a block are observed, then all advance (two passes), or each does both at once (FUSED,
+   one pass). Which is faster depends on the processor: roofline.py times them all.
 
-   cc -O3 -march=native -ffp-contract=fast -fopenmp -shared -fPIC [-DSINGLE] [-DONE] roofline.c -o roofline.so              */
+   cc -O3 -march=native -ffp-contract=fast -fopenmp -shared -fPIC
+      [-DSINGLE] [-DFUSED] [-DBYTES=16|32|64] [-DVECTORS=n] roofline.c -o roofline.so                                      */
 
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-#ifdef __AVX512F__
+#if defined __AVX__
 #include <immintrin.h>
 #endif
 
-#define BYTES 64 /* of a vector; the compiler splits it where the machine has shorter ones */
+#ifndef BYTES /* of a vector; the compiler splits it where the machine has shorter ones */
+#if defined __AVX512F__
+#define BYTES 64
+#elif defined __AVX__
+#define BYTES 32
+#else
+#define BYTES 16
+#endif
+#endif
+#ifndef VECTORS
+#define VECTORS 16 /* in a block */
+#endif
 
 #ifdef SINGLE
 typedef float real;
 typedef int32_t word;
 #define R(x) x##f
-#define LANES_IN_CACHE 256
 #define SHIFTER 12582912.0f /* 1.5 * 2^23: adding it rounds to a whole number, which the low bits then hold */
 #define EPS 1.1920928955078125e-7f
 #else
 typedef double real;
 typedef int64_t word;
 #define R(x) x
-#define LANES_IN_CACHE 128
 #define SHIFTER 6755399441055744.0
 #define EPS 2.220446049250313e-16
 #endif
@@ -36,18 +48,18 @@ typedef int64_t word;
 typedef real vec __attribute__((vector_size(BYTES)));
 typedef word mask __attribute__((vector_size(BYTES))); /* also whole numbers */
 #define WIDTH ((int)(BYTES / sizeof(real)))
-#ifdef ONE /* vector at a time, for a single start */
-#define LANES WIDTH
-#else
-#define LANES LANES_IN_CACHE
-#endif
+#define LANES (VECTORS * WIDTH)
 #define INLINE static inline __attribute__((always_inline))
 
 INLINE vec choose(mask m, vec a, vec b) {
-#if defined __AVX512DQ__ && defined SINGLE
+#if BYTES == 64 && defined __AVX512DQ__ && defined SINGLE
     return (vec)_mm512_mask_blend_ps(_mm512_movepi32_mask((__m512i)m), (__m512)b, (__m512)a);
-#elif defined __AVX512DQ__
+#elif BYTES == 64 && defined __AVX512DQ__
     return (vec)_mm512_mask_blend_pd(_mm512_movepi64_mask((__m512i)m), (__m512d)b, (__m512d)a);
+#elif BYTES == 32 && defined __AVX__ && defined SINGLE
+    return (vec)_mm256_blendv_ps((__m256)b, (__m256)a, (__m256)m);
+#elif BYTES == 32 && defined __AVX__
+    return (vec)_mm256_blendv_pd((__m256d)b, (__m256d)a, (__m256d)m);
 #else
     return (vec)((m & (mask)a) | (~m & (mask)b));
 #endif
@@ -55,10 +67,14 @@ INLINE vec choose(mask m, vec a, vec b) {
 
 /* As in JAX, NaN if one of them is; where that matters, the sum of all is looked at. */
 INLINE vec largest(vec a, vec b) {
-#if defined __AVX512F__ && defined SINGLE
+#if BYTES == 64 && defined __AVX512F__ && defined SINGLE
     return (vec)_mm512_max_ps((__m512)a, (__m512)b);
-#elif defined __AVX512F__
+#elif BYTES == 64 && defined __AVX512F__
     return (vec)_mm512_max_pd((__m512d)a, (__m512d)b);
+#elif BYTES == 32 && defined __AVX__ && defined SINGLE
+    return (vec)_mm256_max_ps((__m256)a, (__m256)b);
+#elif BYTES == 32 && defined __AVX__
+    return (vec)_mm256_max_pd((__m256d)a, (__m256d)b);
 #else
     return choose(a > b, a, b);
 #endif
@@ -101,7 +117,7 @@ typedef struct {
     vec x, theta;
 } pair;
 
-/* Range reduction of Cody and Waite; kernels of fdlibm (double) and Cephes (single): see cpjax/numeric/trigonometry.py
+/* Range reduction of Cody and Waite; kernels of fdlibm (double) and Cephes (single): see cpjax/backend/trigonometry.py
    for their notices. */
 INLINE angle sin_cos(vec theta) {
     vec shifted = theta * R(0.63661977236758134308) + SHIFTER, n = shifted - SHIFTER;
@@ -222,8 +238,16 @@ INLINE void advance(const parameters *p, const constants *k, lanes *b, angle a, 
     b->flag |= ~(stopped | good) & ((finite & RUNAWAY) | (~finite & NON_FINITE));
 }
 
+/* Whether no lane turns so fast that its angle may change by more than 0.1 in a step; half, as a step may speed it up. */
+INLINE int slow(vec theta_dot, real dt) {
+    vec turn = magnitude(theta_dot) * dt;
+    mask fast = ~(turn <= R(0.05));
+    word any = 0;
+    for (int j = 0; j < WIDTH; j++) any |= fast[j];
+    return !any;
+}
+
 static void simulate(const parameters *p, const constants *k, long steps, lanes *block) {
-    enum { VECTORS = LANES / WIDTH };
     for (int i = 0; i < VECTORS; i++) {
         lanes *b = &block[i];
         angle a = sin_cos(b->theta);
@@ -231,22 +255,33 @@ static void simulate(const parameters *p, const constants *k, long steps, lanes 
         b->voltage = applied(p, k, a, b, b->mode);
         b->entered = all(INFINITY);
     }
+#ifndef FUSED
     angle angles[VECTORS];
     pair rates[VECTORS];
+#endif
     for (long step = 0; step < steps; step++) {
         real time = (real)step * p->dt, elapsed = step > 0 ? p->dt : 0;
+#ifdef FUSED
+        for (int i = 0; i < VECTORS; i++) {
+            angle a = sin_cos(block[i].theta);
+            pair rates = observe(p, k, &block[i], a, time, elapsed);
+            if (slow(block[i].theta_dot, p->dt))
+                advance(p, k, &block[i], a, rates, 1);
+            else
+                advance(p, k, &block[i], a, rates, 0);
+        }
+#else
         vec fastest = {0};
         for (int i = 0; i < VECTORS; i++) fastest = largest(fastest, magnitude(block[i].theta_dot));
-        int slow = 1;
-        for (int j = 0; j < WIDTH; j++) slow &= fastest[j] * p->dt <= R(0.05); /* half of 0.1: a step may speed it up */
         for (int i = 0; i < VECTORS; i++) {
             angles[i] = sin_cos(block[i].theta);
             rates[i] = observe(p, k, &block[i], angles[i], time, elapsed);
         }
-        if (slow)
+        if (slow(fastest, p->dt))
             for (int i = 0; i < VECTORS; i++) advance(p, k, &block[i], angles[i], rates[i], 1);
         else
             for (int i = 0; i < VECTORS; i++) advance(p, k, &block[i], angles[i], rates[i], 0);
+#endif
     }
     for (int i = 0; i < VECTORS; i++)
         observe(p, k, &block[i], sin_cos(block[i].theta), (real)steps * p->dt, steps > 0 ? p->dt : 0);
@@ -270,7 +305,7 @@ void roofline(const parameters *given, long n, long steps, const real *starts, r
     const long blocks = (n + LANES - 1) / LANES;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
     for (long block = 0; block < blocks; block++) {
-        lanes b[LANES / WIDTH];
+        lanes b[VECTORS];
         const long first = block * LANES, count = n - first < LANES ? n - first : LANES;
         memset(b, 0, sizeof b);
         for (int i = 0; i < LANES; i++) {

@@ -1,12 +1,19 @@
-"""Compiles `roofline.c` with the system's compiler and calls it."""
+"""Compiles `roofline.c` with the system's compiler, in each of its forms, and calls the one that is fastest here."""
 
 import ctypes
+import hashlib
+import itertools
+import json
 import math
 import os
+import platform
 import shutil
 import subprocess
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +23,29 @@ from cpjax.plant.state import State
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 
 SOURCE = Path(__file__).with_name("roofline.c")
-FLAGS = ["-O3", "-march=native", "-ffp-contract=fast", "-fopenmp", "-shared", "-fPIC"]
+FLAGS = ["-O3", "-march=native", "-ffp-contract=fast", "-fopenmp", "-shared", "-fPIC", "-Wno-psabi"]
+TRIAL_STEPS, TRIALS = 200, 5
+
+
+class Form(NamedTuple):
+    """One way to compile the file."""
+
+    fused: bool
+    """Whether each vector is observed and advanced at once; else all vectors of a block in two passes."""
+    bytes: int
+    """Of a vector."""
+    vectors: int
+    """In a block."""
+
+    @property
+    def flags(self) -> list[str]:
+        """The compiler's flags."""
+        return ["-DFUSED"] * self.fused + [f"-DBYTES={self.bytes}", f"-DVECTORS={self.vectors}"]
+
+    @property
+    def words(self) -> str:
+        """What a table says."""
+        return f"{'one pass' if self.fused else 'two passes'}, {self.bytes}-byte vectors, {self.vectors} a block"
 
 
 def compiler() -> str | None:
@@ -24,16 +53,54 @@ def compiler() -> str | None:
     return shutil.which(os.environ.get("CC", "cc"))
 
 
-def build(folder: Path, dtype: str, one: bool = False) -> ctypes.CDLL:
-    """The compiled library for "float32" or "float64", made in `folder`; `one`: for a single start."""
+def build(dtype: str, plant: CartPole, controller: Hybrid, starts: State, threads: int) -> tuple[ctypes.CDLL, Form]:
+    """The fastest of all forms for "float32" or "float64" on this machine, and which it is.
+
+    All are compiled and timed with these starts once; the choice is kept in the system's folder for temporary files.
+    """
     cc = compiler()
     if cc is None:
         raise FileNotFoundError("no C compiler")
-    folder.mkdir(parents=True, exist_ok=True)
-    library = folder / f"roofline-{dtype}{'-one' * one}.so"
-    kind = ["-DSINGLE"] * (dtype == "float32") + ["-DONE"] * one
-    subprocess.run([cc, *FLAGS, *kind, str(SOURCE), "-o", str(library)], check=True)
-    return ctypes.CDLL(str(library.resolve()))
+    one = int(np.shape(starts.x)[0]) == 1
+    forms = [Form(*form) for form in itertools.product((False, True), (16, 32, 64), (1,) if one else (2, 8, 32))]
+    machine = (platform.processor(), _processor(), cc, *FLAGS, dtype, str(one), str(threads))
+    name = hashlib.sha256("\n".join((SOURCE.read_text(), *machine)).encode()).hexdigest()[:16]
+    folder = Path(tempfile.gettempdir()) / f"cpjax-roofline-{name}"
+    chosen = folder / "chosen.json"
+    if not chosen.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        kind = ["-DSINGLE"] * (dtype == "float32")
+
+        def made(form: Form) -> ctypes.CDLL:
+            library = _library(folder, form)
+            subprocess.run([cc, *FLAGS, *kind, *form.flags, str(SOURCE), "-o", str(library)], check=True)
+            return ctypes.CDLL(str(library))
+
+        with ThreadPoolExecutor() as pool:
+            libraries = dict(zip(forms, pool.map(made, forms), strict=True))
+        seconds = dict.fromkeys(forms, math.inf)
+        for form in forms * TRIALS:
+            begin = time.perf_counter()
+            run(libraries[form], plant, controller, starts, TRIAL_STEPS, 2e-3, threads)
+            seconds[form] = min(seconds[form], time.perf_counter() - begin)
+        fastest = min(forms, key=lambda form: seconds[form])
+        (folder / "chosen.tmp").write_text(json.dumps(fastest))
+        (folder / "chosen.tmp").replace(chosen)
+    form = Form(*json.loads(chosen.read_text()))
+    return ctypes.CDLL(str(_library(folder, form))), form
+
+
+def _library(folder: Path, form: Form) -> Path:
+    return (folder / f"{'fused' if form.fused else 'passes'}-{form.bytes}-{form.vectors}.so").resolve()
+
+
+def _processor() -> str:
+    """The processor's features, as Linux names them; "" elsewhere."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return ""
+    return next((line for line in lines if line.startswith(("flags", "Features"))), "")
 
 
 def run(

@@ -29,6 +29,7 @@ from jaxtyping import Array, Bool, Float, Shaped
 
 from cpjax.controllers import DesignName
 from cpjax.numeric.pareto import hypervolume, nondominated
+from cpjax.numeric.selection import where
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
 from cpjax.rig import Rig, plant_of
@@ -278,7 +279,7 @@ class Tracer:
                     jump = np.array([time < 0.98 * now for (_, time), now in zip(better, times, strict=True)])
                     noise = plan.explore * (1.0 - (step + 1) / plan.steps) * random.standard_normal(vectors.shape)
                     taken = np.stack([vector for vector, _ in better]) + noise
-                    vectors = jnp.where(jump[:, None], taken.astype(vectors.dtype), vectors)
+                    vectors = where(jump[:, None], taken.astype(vectors.dtype), vectors)
                     state = jax.tree.map(functools.partial(_forgotten, rows=jump), state)
             report(step + 1, f"{len(jobs)} tunings side by side")
         return archive
@@ -305,11 +306,11 @@ class Tracer:
 
         slopes, spent = jax.vmap(jax.grad(objective, has_aux=True), in_axes=(None, 0))(vector, starts)
         sound = jnp.all(jnp.isfinite(slopes), axis=1)
-        slopes = jnp.where(sound[:, None], slopes, 0.0)
+        slopes = where(sound[:, None], slopes, 0.0)
         slope = jnp.mean(descent.clip_factors(slopes, sound, plan.clip)[:, None] * slopes, axis=0)
         return slope, jnp.mean(jnp.nan_to_num(jnp.stack(spent, axis=1)), axis=0)
 
 
 def _forgotten(leaf: Shaped[Array, "*leaf"], rows: Bool[np.ndarray, " rows"]) -> Shaped[Array, "*leaf"]:
     """Returns a leaf of the optimiser's state with some rows of its moments reset to zero."""
-    return jnp.where(rows[:, None], 0.0, leaf).astype(leaf.dtype) if leaf.ndim == 2 else leaf
+    return where(rows[:, None], 0.0, leaf).astype(leaf.dtype) if leaf.ndim == 2 else leaf
