@@ -149,7 +149,7 @@ def test_compare_writes_its_table_and_pictures(tmp_path, command):
 def test_a_comparison_in_which_nothing_settles_says_so_without_figures():
     results = compare(PLANT, entries(PLANT), EvaluationConfig(count=2, duration=1.5, dt=0.005))[1]
     for sentence in findings(results):
-        assert "catches none of the starts" in sentence
+        assert "catches none of the initial states" in sentence
         assert "nan" not in sentence
 
 
