@@ -2,9 +2,9 @@
 
     python experiments/cost_of_the_bench.py
 
-Two tables, both after `configure_cpu()`. Located: 512 runs under `vmap`, values and gradients in the cart's mass, on
-the continuous clock with dry friction and without. Per step: sweeps of 4,096 `hanging` initial states, in both
-precisions.
+Two tables, both after `configure_cpu()`. Located: 128 runs under `vmap`, as many as a step of `cpjax tune` has, values
+and gradients in the cart's mass, on the continuous clock with dry friction and without. Per step: sweeps of 4,096
+`hanging` initial states, in both precisions.
 Every case is compiled first; then all run in turn, several times, so that a busy machine slows all of them. A ratio is
 that of the medians over the laps.
 """
@@ -25,7 +25,7 @@ import cpjax
 from cpjax import files, paper
 from cpjax.cli.tables import print_table
 
-DURATION, PERIOD, RUNS, STARTS = 4.0, 2e-3, 512, 4096
+DURATION, PERIOD, RUNS, STARTS = 4.0, 2e-3, 128, 4096
 PLANT = paper.appendix_plant()
 LAW = paper.controller("corrected-centred", "placement", PLANT)
 DRY = dataclasses.replace(PLANT, coulomb_friction=1.0, pivot_coulomb_friction=0.01, static_friction_ratio=1.2)
