@@ -21,7 +21,7 @@ test: check  ## linter, type checker, tests with warnings as errors
 test-slow: .venv/ready-test  ## the tests that take minutes
 	$(BIN)/python -m pytest -n 2 -m slow
 
-coverage: .venv/ready-test  ## the tests of `make test`, and which lines and branches of cpjax/ they reach
+coverage: .venv/ready-test  ## the lines and branches of cpjax/ that the tests of `make test` reach in their own processes
 	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --cov
 
 check: .venv/ready-test
@@ -40,7 +40,7 @@ build: .venv/ready-test  ## sdist and wheel in dist/
 	$(BIN)/python -m build --outdir dist
 
 clean:
-	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .coverage*
 
 .venv/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "cpjax needs Python 3.11 or newer; this is " + sys.version.split()[0] + ". Use: make PYTHON=python3.11")'

@@ -169,6 +169,7 @@ def calls():
         "numeric.quantisation.quantize": call(jnp.ones((2, 3)), 0.1, derivative="straight_through"),
         "numeric.roots.crossing_fraction": call(one, -one, -one, -one),
         "numeric.roots.newton_correction": call(one, -one, one),
+        "numeric.selection.where": call(jnp.asarray([True, False]), jnp.ones(2), 0),
         "numeric.small_matrices.transpose": call(wide),
         "numeric.small_matrices.identity_like": call(batch),
         "numeric.small_matrices.symmetric": call(batch),

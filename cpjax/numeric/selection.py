@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Num
 
 from cpjax.pytree import JaxOrNumpy, Scalar
 
-_Value: TypeAlias = Scalar | np.number[Any] | np.bool | Num[JaxOrNumpy, "..."] | Bool[JaxOrNumpy, "..."]
+_Value: TypeAlias = bool | int | Scalar | np.number[Any] | np.bool | Num[JaxOrNumpy, "..."] | Bool[JaxOrNumpy, "..."]
 
 
 def where(
@@ -19,7 +19,7 @@ def where(
     """Returns `x` where the condition holds, else `y`; results and errors are those of `jnp.where`.
 
     Every `jnp.where` is a function of its own to JAX, which differentiates and lowers it as such. A rollout has
-    hundreds of them, and is traced faster without.
+    hundreds of them, and is traced faster without them.
 
     Args:
       condition: of bool, any shape.

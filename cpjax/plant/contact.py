@@ -36,7 +36,8 @@ _SLOWEST_REBOUND = 1e-3
 """Rebounds of the cart below this speed [m/s] end at rest: with restitution, infinitely many follow one another."""
 
 _LOOSE = 3
-"""Mode between `jump` and `release` of what no longer holds: `release`, which knows the input, finds the direction."""
+"""Mode, between `jump` and `release`, of an axis that is no longer held: `release`, which knows the input, finds the
+direction."""
 
 _NO_END = 1.0
 """Guard of a mode that ends otherwise."""
@@ -135,7 +136,8 @@ class InContact:
     def guards(self, q: Pair, v: Pair, u: Scalar, mode: ContactMode) -> tuple[Scalar, ...]:
         """Returns what ends a mode below zero: of the cart, of the pole, then the distance to the nearer stop.
 
-        Each is smooth where it is about zero. With one guard for two directions there are fewer to compare.
+        Guard 0 is the cart's, the next the pole's if the pivot has dry friction, the last the stops' if there are any.
+        Each is smooth near zero, and may have a kink elsewhere: one guard serves two directions.
         """
         geometry = self.geometry(q)
         cart, pole = self._holding(geometry, self.free.loads(geometry, v, u), mode)
@@ -148,7 +150,7 @@ class InContact:
         )
 
     def jump(self, q: Pair, v: Pair, mode: ContactMode, guard: Int[Array, ""]) -> tuple[Pair, Pair, ContactMode]:
-        """Returns positions, velocities and mode after a guard has fallen; what no longer holds is `_LOOSE`."""
+        """Returns positions, velocities and mode after a guard has fallen; an axis no longer held is `_LOOSE`."""
         cart, pole = mode
         x, x_dot = q[0], v[0]
         theta_dot = v[1]
@@ -156,7 +158,8 @@ class InContact:
         coupling = self._coupling(self.geometry(q))
         of_cart = guard == 0
         x_dot = where(of_cart & sliding, 0.0, x_dot)
-        after = where(of_cart, where(sliding, HELD, _LOOSE), cart)
+        leaving = where(cart == HELD, _LOOSE, -jnp.sign(cart))  # a stop has one way out
+        after = where(of_cart, where(sliding, HELD, leaving), cart)
         number = 1
         if self.free.pivot_coulomb_friction is not None:
             of_pole = guard == 1
@@ -189,7 +192,8 @@ class InContact:
         """Returns the mode that the input imposes at once: what is held slides where the static friction is exceeded,
         and what is loose slides as it is pushed.
 
-        Each is released in turn, with the other's state known: first the cart, then the pole, then the cart again.
+        Each is released in turn, with the other's state known: first a loose pole, then the cart, the pole and the cart
+        again.
         """
         geometry = self.geometry(q)
         smooth = self.free.loads(geometry, v, u)  # the same in every mode
@@ -285,7 +289,7 @@ def in_contact(plant: Any, half_length: Scalar | None = None, restitution: Scala
 def _end(mode: Int[Array, ""], rate: Scalar | None, force: Scalar, static: Scalar) -> Scalar:
     """Returns the guard of one axis.
 
-    Sliding: the speed, or none without dry friction. Held: what is left of the static friction.
+    Sliding: the speed, or `_NO_END` without dry friction. Held: what is left of the static friction.
     At a stop: what is left of the force that presses the cart against it, static friction included.
     """
     side = jnp.sign(mode).astype(jnp.asarray(force).dtype)
@@ -295,5 +299,5 @@ def _end(mode: Int[Array, ""], rate: Scalar | None, force: Scalar, static: Scala
 
 
 def _direction(force: Scalar) -> Int[Array, ""]:
-    """Returns the mode of what slides as a force pushes it."""
+    """Returns the sliding mode, 1 or -1, in the direction of a force."""
     return where(force > 0.0, np.int32(1), np.int32(-1))

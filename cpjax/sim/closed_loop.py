@@ -56,6 +56,7 @@ class ContinuousLoop(NamedTuple):
         margin = real("controller.margin", call("controller", self.controller, "margin", state, mode.law))
         u = self._applied(demanded, mode.clip)
         guards = (
+            # Inside, one guard for both limits: its kink at 0 is far from where it falls.
             where(mode.clip == 0, 1.0 - jnp.abs(relative), where(mode.clip > 0, relative, -relative) - 1.0),
             margin.astype(dtype_of(state)),
             *plant_guards(self.plant, q, v, u, mode.plant),

@@ -125,7 +125,7 @@ def _sample(plant: Plant, loop: _Loop, before: Motion, dt: Step) -> Sample:
     held = isinstance(motion.mode, HeldMode)
     landed = (before.phase == LANDED) & ~failures.is_stopped(loop.flag)
     state = plants.state_of(plant, motion.q, motion.v)
-    crossing = before.guard + GATE_CROSSING + (1 if held else -GATE)
+    crossing = before.guard - (-1 if held else GATE) + GATE_CROSSING  # the plant's own guards follow the gate's
     if not held:
         crossing = where(before.guard == LIMIT, where(motion.current.output > 0.0, 1, 2), crossing)
     return Sample(

@@ -52,7 +52,7 @@ class Sample(NamedTuple):
     """Bits of `Flag`."""
     crossing: Int[Array, ""]
     """Event located at this sample, int32: 0 none, 1 and 2 the upper and the lower voltage limit, 3 the gate; from 4 on
-    the plant's own events."""
+    the plant's own events, in the order of its guards."""
     crossing_speed: Float[Array, ""]
     """Rate at which that guard (relative voltage, gate margin, plant's guard) fell [its unit/s]; 0 without an event."""
 

@@ -79,7 +79,7 @@ class Geometric(Protocol):
 class Eventful(Protocol):
     """A plant with modes of its own, such as stick and slip, or the ends of a track.
 
-    Its `accelerations` take the mode as a fourth argument. A mode ends where a guard, a smooth function, falls below
+    Its `accelerations` take the mode as a fourth argument. A mode ends where a guard, smooth near zero, falls below
     zero; that instant is located inside the integrator's step.
     """
 
@@ -88,7 +88,7 @@ class Eventful(Protocol):
         ...
 
     def guards(self, q: Tree, v: Tree, u: Scalar, mode: Tree) -> tuple[Scalar, ...]:
-        """Returns scalars that are at least 0 while the mode lasts; a fixed number of them, smooth in q, v and u."""
+        """Returns scalars that are at least 0 while the mode lasts; a fixed number of them, smooth near zero."""
         ...
 
     def jump(self, q: Tree, v: Tree, mode: Tree, guard: Int[Array, ""]) -> tuple[Tree, Tree, Tree]:

@@ -1,6 +1,7 @@
 """Fixed steps with changes of mode located inside them. Independent of the plant.
 
-A system q'' = a(q, v) is smooth within a mode; guards, smooth functions of q and v, stay positive while the mode lasts.
+A system q'' = a(q, v) is smooth within a mode; guards, functions of q and v that are smooth near zero, stay positive
+while the mode lasts. (A kink elsewhere costs iterations, as the cubic of the first estimate fits it badly.)
 A step after which a guard is negative is rejected: the crossing is located, the step is repeated up to it, the mode
 changes, and another step completes the first. So every Runge-Kutta step stays inside one mode, which preserves the
 method's order, and the instant of the change moves with the parameters as in the continuous system, which preserves the
@@ -65,7 +66,7 @@ class System(Protocol):
     """Second-order system q'' = a(q, v) with modes."""
 
     def observe(self, q: Tree, v: Tree, mode: Tree) -> Observation:
-        """Returns the accelerations, guards and output, smooth in q and v."""
+        """Returns the accelerations and output, smooth in q and v, and the guards, smooth near zero."""
         ...
 
     def jump(self, q: Tree, v: Tree, mode: Tree, guard: Int[Array, ""]) -> tuple[Tree, Tree, Tree]:

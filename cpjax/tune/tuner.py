@@ -55,7 +55,7 @@ def tune(
       plant: the plant on which controllers are run.
       free: the free parameters, and the initial controller.
       plan: the configuration.
-      progress: called with the steps done, their number, and loss and success rate in words.
+      progress: called with the steps done, their number, and what is done or was reached, in words.
       checkpoint: a file that is written after each validation. A tuning resumes from it if it exists, and its result
         is bitwise that of an uninterrupted one.
 

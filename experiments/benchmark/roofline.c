@@ -238,7 +238,8 @@ INLINE void advance(const parameters *p, const constants *k, lanes *b, angle a, 
     b->flag |= ~(stopped | good) & ((finite & RUNAWAY) | (~finite & NON_FINITE));
 }
 
-/* Whether no lane turns so fast that its angle may change by more than 0.1 in a step; half, as a step may speed it up. */
+/* Whether no lane turns so fast that its angle may change by more than 0.1 in a step. The bound is half of that, as a
+   step may speed the pole up. */
 INLINE int slow(vec theta_dot, real dt) {
     vec turn = magnitude(theta_dot) * dt;
     mask fast = ~(turn <= R(0.05));

@@ -6,7 +6,6 @@ import itertools
 import json
 import math
 import os
-import platform
 import shutil
 import subprocess
 import tempfile
@@ -24,7 +23,10 @@ from cpjax.sim.metrics import Metrics, ProtocolMetrics
 
 SOURCE = Path(__file__).with_name("roofline.c")
 FLAGS = ["-O3", "-march=native", "-ffp-contract=fast", "-fopenmp", "-shared", "-fPIC", "-Wno-psabi"]
-TRIAL_STEPS, TRIALS = 200, 5
+TRIALS = 5
+TRIAL_STEPS = 4_000_000
+"""Steps of a trial, all starts together."""
+BUILT = Path(__file__).parents[2] / "build" / "roofline"
 
 
 class Form(NamedTuple):
@@ -39,40 +41,42 @@ class Form(NamedTuple):
 
     @property
     def flags(self) -> list[str]:
-        """The compiler's flags."""
+        """Returns the compiler's flags."""
         return ["-DFUSED"] * self.fused + [f"-DBYTES={self.bytes}", f"-DVECTORS={self.vectors}"]
 
     @property
     def words(self) -> str:
-        """What a table says."""
+        """Returns the form in words, for a table."""
         return f"{'one pass' if self.fused else 'two passes'}, {self.bytes}-byte vectors, {self.vectors} a block"
 
 
 def compiler() -> str | None:
-    """The C compiler: $CC, or the system's; None if there is none."""
+    """Returns the C compiler: $CC, or the system's; None if there is none."""
     return shutil.which(os.environ.get("CC", "cc"))
 
 
 def build(dtype: str, plant: CartPole, controller: Hybrid, starts: State, threads: int) -> tuple[ctypes.CDLL, Form]:
-    """The fastest of all forms for "float32" or "float64" on this machine, and which it is.
+    """Returns the fastest of all forms for "float32" or "float64" on this machine, and which it is.
 
-    All are compiled and timed with these starts once; the choice is kept in the system's folder for temporary files.
+    All are compiled and timed with these starts once; libraries and choice are kept in build/.
     """
     cc = compiler()
     if cc is None:
         raise FileNotFoundError("no C compiler")
-    one = int(np.shape(starts.x)[0]) == 1
-    forms = [Form(*form) for form in itertools.product((False, True), (16, 32, 64), (1,) if one else (2, 8, 32))]
-    machine = (platform.processor(), _processor(), cc, *FLAGS, dtype, str(one), str(threads))
-    name = hashlib.sha256("\n".join((SOURCE.read_text(), *machine)).encode()).hexdigest()[:16]
-    folder = Path(tempfile.gettempdir()) / f"cpjax-roofline-{name}"
-    chosen = folder / "chosen.json"
-    if not chosen.exists():
-        folder.mkdir(parents=True, exist_ok=True)
+    count = int(np.shape(starts.x)[0])
+    forms = [
+        Form(*form) for form in itertools.product((False, True), (16, 32, 64), (1,) if count == 1 else (2, 8, 16, 32))
+    ]
+    release = subprocess.run([cc, "--version"], capture_output=True, text=True, check=True).stdout
+    key = (_processor(), release, *FLAGS, dtype, str(count), str(threads), repr(forms), str(TRIAL_STEPS))
+    folder = BUILT / hashlib.sha256("\n".join((SOURCE.read_text(), *key)).encode()).hexdigest()[:16]
+    if not folder.exists():
+        BUILT.mkdir(parents=True, exist_ok=True)
+        begun = Path(tempfile.mkdtemp(dir=BUILT))
         kind = ["-DSINGLE"] * (dtype == "float32")
 
         def made(form: Form) -> ctypes.CDLL:
-            library = _library(folder, form)
+            library = _library(begun, form)
             subprocess.run([cc, *FLAGS, *kind, *form.flags, str(SOURCE), "-o", str(library)], check=True)
             return ctypes.CDLL(str(library))
 
@@ -81,12 +85,14 @@ def build(dtype: str, plant: CartPole, controller: Hybrid, starts: State, thread
         seconds = dict.fromkeys(forms, math.inf)
         for form in forms * TRIALS:
             begin = time.perf_counter()
-            run(libraries[form], plant, controller, starts, TRIAL_STEPS, 2e-3, threads)
+            run(libraries[form], plant, controller, starts, TRIAL_STEPS // count, 2e-3, threads)
             seconds[form] = min(seconds[form], time.perf_counter() - begin)
-        fastest = min(forms, key=lambda form: seconds[form])
-        (folder / "chosen.tmp").write_text(json.dumps(fastest))
-        (folder / "chosen.tmp").replace(chosen)
-    form = Form(*json.loads(chosen.read_text()))
+        (begun / "chosen.json").write_text(json.dumps(min(forms, key=lambda form: seconds[form])))
+        try:
+            begun.rename(folder)
+        except OSError:  # another process was first
+            shutil.rmtree(begun)
+    form = Form(*json.loads((folder / "chosen.json").read_text()))
     return ctypes.CDLL(str(_library(folder, form))), form
 
 
@@ -95,7 +101,7 @@ def _library(folder: Path, form: Form) -> Path:
 
 
 def _processor() -> str:
-    """The processor's features, as Linux names them; "" elsewhere."""
+    """Returns the processor's features, as Linux names them; "" elsewhere."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -16,6 +16,7 @@ from scipy.integrate import solve_ivp
 import cpjax
 from cpjax import CartPole, ForceActuator, InputError, Rig, State, Track, paper
 from cpjax.numeric.differences import central_differences
+from cpjax.plant.contact import AT_STOP, ContactMode, in_contact
 from cpjax.pytree import Scalar, pytree
 
 PLANT = paper.appendix_plant()
@@ -179,6 +180,44 @@ def test_a_cart_pressed_against_a_stop_stays_until_it_is_pulled_away():
     assert np.all(x[250:500] == 0.1)
     assert x[-1] < 0.0
     assert int(run.flag) == 0
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_the_way_off_a_stop_is_away_from_it_whatever_rounding_leaves_of_the_force(side):
+    contact = in_contact(PLANT, 0.1)
+    q, v = (jnp.asarray(0.1 * side), jnp.asarray(math.pi)), (jnp.asarray(0.0), jnp.asarray(0.0))
+    mode = ContactMode(jnp.asarray(side * AT_STOP, jnp.int32), jnp.asarray(1, jnp.int32))
+    after = contact.jump(q, v, mode, jnp.asarray(0, jnp.int32))
+    assert int(contact.release(*after[:2], jnp.asarray(0.0), after[2]).cart) == -side
+
+
+@pytree
+class IntoTheStop:
+    """How often the cart's mode is to slide into the stop at which it is, and whether it left."""
+
+    def init(self, sample):
+        return jnp.asarray(0, jnp.int32), sample.state.x
+
+    def update(self, memory, sample):
+        count, least = memory
+        into = (sample.plant_mode.cart == 1) & (sample.state.x == 0.1)
+        return count + into.astype(count.dtype), jnp.minimum(least, sample.state.x)
+
+    def finalize(self, memory, last):
+        return memory
+
+
+@pytest.mark.parametrize("switching", ["per_step", "located"])
+@pytest.mark.parametrize("friction", [None, 0.4])
+def test_a_cart_that_the_pole_pulls_off_a_stop_slides_away_from_it(switching, friction):
+    plant = dataclasses.replace(PLANT, coulomb_friction=friction)
+    rig = Rig(plant, track=Track(half_length=0.1, ends="stop"))
+    settings = {"duration": 1.5, "dt": 2e-3, "clock": "sampled", "switching": switching, "metrics": IntoTheStop()}
+    count, least = cpjax.measure(
+        rig, cpjax.VoltageSignal([0.0], [0.0]), State(0.1, 0.0, math.pi - 1.5, 0.0), **settings
+    )
+    assert count == 0
+    assert least < 0.1
 
 
 @pytest.mark.slow
