@@ -21,7 +21,7 @@ test: check  ## linter, type checker, tests with warnings as errors
 test-slow: .venv/ready-test  ## the tests that take minutes
 	$(BIN)/python -m pytest -n 2 -m slow
 
-coverage: .venv/ready-test  ## the lines and branches of cpjax/ that the tests of `make test` reach in their own processes
+coverage: .venv/ready-test  ## the lines and branches of cpjax/ that the tests of `make test` reach
 	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --cov
 
 check: .venv/ready-test
