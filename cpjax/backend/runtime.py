@@ -85,7 +85,7 @@ def keep_compilations() -> Path | None:
         return None
     if folder is None:
         # Compiled code is specific to one kind of CPU, and several kinds may share a home folder.
-        kind = hashlib.sha256(_cpu().encode()).hexdigest()[:12]
+        kind = hashlib.sha256(instruction_set().encode()).hexdigest()[:12]
         cache = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
         folder = os.path.join(cache, "cpjax", kind)
     try:
@@ -103,7 +103,7 @@ def keep_compilations() -> Path | None:
     return Path(folder)
 
 
-def _cpu() -> str:
+def instruction_set() -> str:
     """Returns a text that identifies the instruction set of this CPU."""
     try:
         with open("/proc/cpuinfo") as lines:

@@ -131,8 +131,7 @@ def root_near(condition: _OfFrequency, guess: jax.Array, loop: Loop, scale: jax.
 
     Without a root on the axis they do not: for a zero at a distance d from the axis they stay longer than d.
     """
-    # Newton's iterates have no derivative worth having: `tied` gives the root that of the equation (implicit function).
-    fixed = lax.stop_gradient(loop)
+    fixed = lax.stop_gradient(loop)  # Newton only searches: `tied` gives the root the derivative of its equation
 
     def newton(_: Any, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         frequency, _ = carry

@@ -144,8 +144,7 @@ def level_within_angle_and_rate(P: Real[MatrixLike, "4 4"], half_angle: Scalar, 
 def _touching_level(shadow: jax.Array, half_angle: jax.Array, rate: jax.Array) -> jax.Array:
     """Returns the level at which the level set's projection on angle and rate (2, 2) touches the gate's boundary."""
     gate = jnp.linalg.inv(shadow), half_angle, rate
-    # The search needs no derivative: the last lines give the level its first and second one.
-    fixed = lax.stop_gradient(gate)
+    fixed = lax.stop_gradient(gate)  # only searches: the last lines give the level its first and second derivative
     # Positions are angles in a plane scaled so that the projection is about as wide as it is high: however different
     # angle and rate are in size, the level then does not vary within a small part of a turn only.
     ratio = half_angle * jnp.sqrt(shadow[1, 1]) / (rate * jnp.sqrt(shadow[0, 0]))

@@ -200,11 +200,11 @@ def _gramian(A: jax.Array, Q: jax.Array, horizon: Scalar | None) -> jax.Array:
 def _gramian_until(A: jax.Array, Q: jax.Array, horizon: jax.Array) -> jax.Array:
     n = A.shape[0]
     norm = jnp.max(jnp.sum(jnp.abs(A), axis=0))
-    # The number of doublings is a step function of A and the horizon, whose derivative is 0 or undefined.
-    doublings = lax.stop_gradient(jnp.clip(jnp.ceil(jnp.log2(norm * horizon)), 0.0, _MOST_DOUBLINGS))
+    wanted = jnp.clip(jnp.ceil(jnp.log2(norm * horizon)), 0.0, _MOST_DOUBLINGS)
+    doublings = lax.stop_gradient(wanted)  # a step function of A and the horizon: its derivative is 0 or undefined
     short = horizon * jnp.exp2(-doublings)
-    # W is linear in Q; in this unit Q does not make the block large. The unit cancels, so it needs no derivative.
-    unit = lax.stop_gradient(jnp.max(jnp.abs(Q)) * short)
+    # W is linear in Q; in this unit Q does not make the block large.
+    unit = lax.stop_gradient(jnp.max(jnp.abs(Q)) * short)  # it cancels, so it needs no derivative
     unit = where(unit > 0.0, unit, 1.0)
     block = jnp.block([[-A, Q / unit], [jnp.zeros_like(A), A.T]])
     exponential = jax.scipy.linalg.expm(block * short)

@@ -33,7 +33,7 @@ def two_sum(a: Float[Array, "*#shape"], b: Float[Array, "*#shape"]) -> DoubleWor
 
     The barrier is needed where one of the two is a constant of the program: XLA would simplify (a + b) - a to b.
     """
-    total = lax.optimization_barrier(a + b)  # type: ignore[no-untyped-call]  # untyped in JAX
+    total = lax.optimization_barrier(a + b)  # type: ignore[no-untyped-call]  # JAX has no annotations for it
     part = total - a
     return DoubleWord(total, (a - (total - part)) + (b - part))
 

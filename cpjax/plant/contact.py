@@ -198,9 +198,10 @@ class InContact:
         geometry = self.geometry(q)
         smooth = self.free.loads(geometry, v, u)  # the same in every mode
         static_x, static_theta = self._static()
-        loose = mode.pole == _LOOSE
-        _, pole = self._holding(geometry, smooth, mode._replace(pole=where(loose, HELD, mode.pole)))
-        mode = mode._replace(pole=where(loose, _direction(pole), mode.pole))
+        if self.free.pivot_coulomb_friction is not None:  # else the pole is never held
+            loose = mode.pole == _LOOSE
+            _, pole = self._holding(geometry, smooth, mode._replace(pole=where(loose, HELD, mode.pole)))
+            mode = mode._replace(pole=where(loose, _direction(pole), mode.pole))
         for axis in ("cart", "pole", "cart"):
             cart, pole = self._holding(geometry, smooth, mode)
             if axis == "pole":

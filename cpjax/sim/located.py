@@ -125,7 +125,8 @@ def _sample(plant: Plant, loop: _Loop, before: Motion, dt: Step) -> Sample:
     held = isinstance(motion.mode, HeldMode)
     landed = (before.phase == LANDED) & ~failures.is_stopped(loop.flag)
     state = plants.state_of(plant, motion.q, motion.v)
-    crossing = before.guard - (-1 if held else GATE) + GATE_CROSSING  # the plant's own guards follow the gate's
+    gate = -1 if held else GATE  # number of the gate's guard, which the plant's own follow
+    crossing = before.guard - gate + GATE_CROSSING
     if not held:
         crossing = where(before.guard == LIMIT, where(motion.current.output > 0.0, 1, 2), crossing)
     return Sample(

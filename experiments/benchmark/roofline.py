@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cpjax.backend.runtime import instruction_set
 from cpjax.controllers import AngleRateGate, EnergySwingUp, Hybrid, StateFeedback
 from cpjax.plant import CartPole
 from cpjax.plant.state import State
@@ -68,7 +69,7 @@ def build(dtype: str, plant: CartPole, controller: Hybrid, starts: State, thread
         Form(*form) for form in itertools.product((False, True), (16, 32, 64), (1,) if count == 1 else (2, 8, 16, 32))
     ]
     release = subprocess.run([cc, "--version"], capture_output=True, text=True, check=True).stdout
-    key = (_processor(), release, *FLAGS, dtype, str(count), str(threads), repr(forms), str(TRIAL_STEPS))
+    key = (instruction_set(), release, *FLAGS, dtype, str(count), str(threads), repr(forms), str(TRIAL_STEPS))
     folder = BUILT / hashlib.sha256("\n".join((SOURCE.read_text(), *key)).encode()).hexdigest()[:16]
     if not folder.exists():
         BUILT.mkdir(parents=True, exist_ok=True)
@@ -98,15 +99,6 @@ def build(dtype: str, plant: CartPole, controller: Hybrid, starts: State, thread
 
 def _library(folder: Path, form: Form) -> Path:
     return (folder / f"{'fused' if form.fused else 'passes'}-{form.bytes}-{form.vectors}.so").resolve()
-
-
-def _processor() -> str:
-    """Returns the processor's features, as Linux names them; "" elsewhere."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return ""
-    return next((line for line in lines if line.startswith(("flags", "Features"))), "")
 
 
 def run(
