@@ -15,14 +15,17 @@ report-full: .venv/ready  ## the same with finer maps and full fronts: some fift
 
 # Most of its time is spent on compiling what then runs for milliseconds, so the compiler optimises less. The slow tests
 # and tests/backend run what users run.
+COMPILE_FASTER := JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS=--xla_cpu_use_fusion_emitters=false
+
 test: check  ## linter, type checker, tests with warnings as errors
-	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+	$(COMPILE_FASTER) $(BIN)/python -m pytest -n 2 --dist worksteal --ignore tests/backend
+	$(BIN)/python -m pytest -n 2 tests/backend
 
 test-slow: .venv/ready-test  ## the tests that take minutes
 	$(BIN)/python -m pytest -n 2 -m slow
 
 coverage: .venv/ready-test  ## the lines and branches of cpjax/ that the tests of `make test` reach
-	JAX_DISABLE_MOST_OPTIMIZATIONS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --cov
+	$(COMPILE_FASTER) $(BIN)/python -m pytest -n 2 --dist worksteal --cov
 
 check: .venv/ready-test
 	$(BIN)/ruff format --check .

@@ -1,5 +1,6 @@
 """Every test runs in float64 with strict dtype promotion; what is about float32 asks for it by name."""
 
+import gc
 import os
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,10 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+# Tracing makes many objects and hardly any garbage: by default a tenth of the time goes to searching for it.
+gc.set_threshold(200_000, 20, 20)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -15,6 +15,7 @@ SLOW = {  # a minute of compiling each, or what the package's own tests hold any
     "accuracy",
     "benchmark",
     "benchmark_design",
+    "compile_times",
     "cost_of_the_bench",
     "damages",
     "friction_derivatives",

@@ -268,13 +268,17 @@ def _block(
         def chunk(column: list[Shaped[Array, "lanes ..."]]) -> Any:
             return jax.vmap(lambda lane: _one(lane, shared, kind), out_axes=(1, 0, 0))(column)
 
+        like: Any = None  # shapes and dtypes of a chunk's results, which its one trace notes
+
         def packed_chunk(column: list[Shaped[Array, "lanes ..."]]) -> Any:
+            nonlocal like
             kept, *others = chunk(column)
+            like = jax.tree.map(jax.typeof, others)
             return kept, _stacked(others)
 
         chunks = [column.reshape(-1, kind.chunk, *column.shape[1:]) for column in columns]
         kept, others = jax.lax.map(packed_chunk, chunks)
-        last, result = _unstacked(others, jax.eval_shape(chunk, [column[0] for column in chunks])[1:])
+        last, result = _unstacked(others, like)
         kept = jax.tree.map(lambda part: jnp.moveaxis(part, 1, 0), kept)  # rows first
         trees = results(kept, last, result), last.flag
         return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), trees)

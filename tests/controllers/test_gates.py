@@ -1,5 +1,6 @@
 """Gates, their hysteresis, and the hybrid law that remembers its mode."""
 
+import functools
 import math
 
 import jax
@@ -104,14 +105,19 @@ def test_each_mode_has_the_voltage_of_its_own_law():
     assert float(regulating) != pytest.approx(float(swinging))
 
 
+def margin_of(gate, v):
+    return gate.margin(State.from_vector(v), jnp.asarray(SWING_UP))
+
+
+MARGIN = [jax.jit(f) for f in (margin_of, jax.jacfwd(margin_of, argnums=1), jax.grad(margin_of, argnums=1))]
+
+
 @rows("gate", [AngleGate(0.4), AngleRateGate(0.4, 2.0), LyapunovGate(P, 0.3)])
 @rows("theta", [0.0, 0.4, -0.4, math.pi, -math.pi, 3 * math.pi, 1.0])
 def test_the_margins_derivative_agrees_forward_in_reverse_and_with_differences(gate, theta):
-    def margin(v):
-        return gate.margin(State.from_vector(v), jnp.asarray(SWING_UP))
-
+    margin, forward, reverse = (functools.partial(function, gate) for function in MARGIN)
     v = jnp.array([0.1, -0.2, theta, 0.3])
-    forward, reverse = jax.jacfwd(margin)(v), jax.grad(margin)(v)
+    forward, reverse = forward(v), reverse(v)
     np.testing.assert_allclose(forward, reverse, rtol=1e-12, atol=1e-14)
     if isinstance(gate, LyapunovGate) and abs(math.remainder(theta, math.tau)) > 3.1:
         return  # the wrapped form jumps there, far outside its level set; its one-sided derivative is finite

@@ -183,7 +183,8 @@ def test_an_observer_halves_the_filtered_derivatives_velocity_error(period):
     commands = np.asarray(run.voltage)[::every]
     zero = (jnp.uint32(0), jnp.uint32(0))
 
-    def errors(estimator):
+    @jax.jit
+    def estimates(estimator):
         def step(carry, row):
             memory, before = carry
             state, command = row
@@ -193,8 +194,10 @@ def test_an_observer_halves_the_filtered_derivatives_velocity_error(period):
 
         first = sensors.measure(State.from_vector(jnp.asarray(states[0])), zero, zero)
         carry = (estimator.init(first), jnp.zeros(()))
-        _, found = jax.lax.scan(step, carry, (jnp.asarray(states), jnp.asarray(commands)))
-        settled = np.asarray(found)[round(0.3 / period) :]
+        return jax.lax.scan(step, carry, (jnp.asarray(states), jnp.asarray(commands)))[1]
+
+    def errors(estimator):
+        settled = np.asarray(estimates(estimator))[round(0.3 / period) :]
         return np.sqrt(np.mean(settled[:, [1, 3]] ** 2, axis=0))
 
     cutoffs = np.geomspace(10.0, 3.0 / period, 25)

@@ -45,14 +45,6 @@ def test_4096_starts_of_10_s_run_under_one_vmap_within_a_gibibyte(monkeypatch):
     assert figures["peak_MiB"] < 1024
 
 
-def test_the_result_does_not_depend_on_chunks_and_blocks():
-    starts = cpjax.sample_starts("anywhere", 70, seed=4)
-    whole = cpjax.sweep(PLANT, CENTRED, starts, duration=0.4, **SAMPLED)
-    for division in ({"chunk": 16}, {"block": 32}, {"chunk": 16, "block": 48}):
-        assert_same(cpjax.sweep(PLANT, CENTRED, starts, duration=0.4, **SAMPLED, **division), whole)
-    assert_same(cpjax.sweep(PLANT, CENTRED, starts, duration=0.4, **SAMPLED, chunk=3), whole, rtol=1e-12)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-9), (np.float32, 3e-3)])
 def test_turned_stage_angles_give_what_full_ones_give(dtype, tolerance):
