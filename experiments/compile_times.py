@@ -8,6 +8,7 @@ first less the second. Gradients are in eight parameters of the corrected, centr
 """
 
 import dataclasses
+import itertools
 import json
 import os
 import statistics
@@ -118,7 +119,7 @@ def _phases(case: str) -> dict[str, float]:
     times.append(time.perf_counter())
     lowered.compile()
     times.append(time.perf_counter())
-    phases = [after - before for before, after in zip(times, times[1:], strict=False)]
+    phases = [after - before for before, after in itertools.pairwise(times)]
     return dict(zip(("trace", "lower", "compile", "all"), [*phases, sum(phases)], strict=True))
 
 
