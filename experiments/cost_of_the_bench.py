@@ -3,7 +3,7 @@
     python experiments/cost_of_the_bench.py
 
 All after `configure_cpu()`. Located: 128 runs under `vmap`, as many as a step of `cpjax tune` has, and 512; values and
-gradients in the cart's mass, on the continuous clock with dry friction and without. Per step: sweeps of 4,096 `hanging`
+gradients in the cart's mass, on the continuous clock with dry friction and without, and values by `cpjax.sweep`. Per step: sweeps of 4,096 `hanging`
 initial states, in both precisions.
 Every case is compiled first; then all run in turn, several times, so that a busy machine slows all of them. A ratio is
 that of the medians over the laps.
@@ -29,6 +29,7 @@ DURATION, PERIOD, RUNS, STARTS = 4.0, 2e-3, (128, 512), 4096
 PLANT = paper.appendix_plant()
 LAW = paper.controller("corrected-centred", "placement", PLANT)
 DRY = dataclasses.replace(PLANT, coulomb_friction=1.0, pivot_coulomb_friction=0.01, static_friction_ratio=1.2)
+PLANTS = {"ideal": PLANT, "dry friction": DRY}
 
 
 def seconds(calls: Mapping[str, Callable[[], Any]], laps: int) -> dict[str, float]:
@@ -54,9 +55,13 @@ def located(count: int, duration: float, laps: int, seed: int) -> dict[str, floa
 
     calls = {}
     for kind, function in (("values", one), ("gradients", jax.value_and_grad(one))):
-        for name, plant in (("ideal", PLANT), ("dry friction", DRY)):
+        for name, plant in PLANTS.items():
             compiled = jax.jit(jax.vmap(functools.partial(function, plant=plant), (None, 0)))
             calls[f"{kind}, {name}"] = functools.partial(compiled, jnp.asarray(PLANT.cart_mass), starts)
+    metric = cpjax.TimeOutside()
+    settings: dict[str, Any] = {"duration": duration, "dt": PERIOD, "clock": "continuous", "switching": "located"}
+    for name, plant in PLANTS.items():
+        calls[f"in a sweep, {name}"] = functools.partial(cpjax.sweep, plant, LAW, starts, metrics=metric, **settings)
     return seconds(calls, laps)
 
 
