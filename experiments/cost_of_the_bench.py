@@ -3,8 +3,8 @@
     python experiments/cost_of_the_bench.py
 
 All after `configure_cpu()`. Located: 128 runs under `vmap`, as many as a step of `cpjax tune` has, and 512; values and
-gradients in the cart's mass, on the continuous clock with dry friction and without, and values by `cpjax.sweep`. Per step: sweeps of 4,096 `hanging`
-initial states, in both precisions.
+gradients in the cart's mass, on the continuous clock with dry friction and without, and values by `cpjax.sweep`.
+Per step: sweeps of 4,096 `hanging` initial states, in both precisions.
 Every case is compiled first; then all run in turn, several times, so that a busy machine slows all of them. A ratio is
 that of the medians over the laps.
 """
