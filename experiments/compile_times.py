@@ -27,6 +27,7 @@ from _common import run
 import cpjax
 from cpjax import files, paper
 from cpjax.cli.tables import print_table
+from cpjax.linear import stability_margins
 
 LOOPS: dict[str, dict[str, Any]] = {
     "sampled": {"clock": "sampled"},
@@ -81,7 +82,7 @@ def _function(case: str) -> tuple[Callable[..., Any], tuple[Any, ...]]:
     if case == "place":
         return lambda poles: cpjax.place(A, B, poles), (jnp.asarray([-3.0, -4.0, -5.0, -6.0]),)
     if case == "stability margins":
-        return lambda K: cpjax.stability_margins(A, B, K[None]), (K,)
+        return lambda K: stability_margins(A, B, K[None]), (K,)
     loop = next((name for name in LOOPS if name in case), "sampled")
     outside = _objective(LOOPS[loop], dry="dry friction" in case, bench="observer" in case)
     function = outside if case.endswith("values") else jax.value_and_grad(outside)
@@ -138,10 +139,10 @@ def _in_a_process(case: str, cache: str) -> dict[str, float]:
     return measured
 
 
-def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
-    """Prints the table and writes compile_times.json."""
+def main(out: Path, quick: bool = False, seed: int = 1, count: int = 3) -> list[dict[str, Any]]:
+    """Prints the table, of medians over `count` laps, and writes compile_times.json."""
     found: dict[str, list[tuple[dict[str, float], dict[str, float]]]] = {}
-    for _ in range(1 if quick else 3):
+    for _ in range(1 if quick else count):
         for case in ("lqr",) if quick else CASES:
             with tempfile.TemporaryDirectory() as cache:
                 found.setdefault(case, []).append((_in_a_process(case, cache), _in_a_process(case, cache)))

@@ -173,7 +173,8 @@ class QuadraticFactors(NamedTuple):
         """
         if any(is_traced(p) for p in jax.tree.leaves(poles)):
             raise InputError("poles", poles, "known numbers, outside jit and vmap")
-        polynomial_from_poles(poles)
+        with jax.ensure_compile_time_eval():  # also inside a function that is traced
+            polynomial_from_poles(poles)
         numbers = np.asarray(poles, dtype=np.complex128)
         if not np.all(numbers.real < 0.0):
             raise InputError("poles", poles, "stable: every real part below 0")
@@ -185,7 +186,8 @@ class QuadraticFactors(NamedTuple):
         first, second = real[0 : len(real) // 2 * 2 : 2], real[1::2]
         a = np.concatenate([-2.0 * upper.real, first + second])
         b = np.concatenate([np.abs(upper) ** 2, first * second])
-        return cls(jnp.asarray(a), jnp.asarray(b), jnp.asarray(real[len(real) // 2 * 2 :]))
+        with jax.ensure_compile_time_eval():
+            return cls(jnp.asarray(a), jnp.asarray(b), jnp.asarray(real[len(real) // 2 * 2 :]))
 
     @classmethod
     def from_unconstrained(cls, x: Float[Array, " n"]) -> "QuadraticFactors":

@@ -136,6 +136,15 @@ def acting(prediction, delay, told, dead_band=0.4):
     return np.max(np.abs(voltage - wanted)[delay:])
 
 
+def test_an_observer_by_poles_may_be_made_inside_a_function_that_is_traced():
+    def gain(period):
+        return Observer(PLANT, poles=[-20.0, -21.0, -30.0, -35.0]).at_period(period).gain
+
+    np.testing.assert_allclose(jax.jit(gain)(0.002), gain(0.002), rtol=1e-12)
+    with pytest.raises(InputError, match="every real part below 0"):
+        jax.jit(lambda x: x * Observer(PLANT, poles=[1.0, -2.0, -3.0, -4.0]).poles.a)(1.0)
+
+
 @pytest.mark.parametrize(
     ("prediction", "delay", "told", "error"),
     [
