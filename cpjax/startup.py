@@ -29,8 +29,8 @@ def prepare() -> None:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)
-    # JAX makes many objects while it traces and drops hardly any: with Python's thresholds a quarter of that time goes
-    # to looking for unreachable ones.
+    # JAX makes many objects while it traces and drops hardly any: with Python's thresholds much of that time goes to
+    # looking for unreachable ones.
     gc.set_threshold(200_000, 20, 20)
     # XLA logs "Very slow compile?" as an error, in the middle of the progress display, which shows the same more
     # clearly; real failures also raise an exception. JAX reads this when it is imported; a value set by the user stays.

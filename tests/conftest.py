@@ -18,7 +18,7 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
-# Tracing makes many objects and hardly any garbage: by default a tenth of the time goes to searching for it.
+# Tracing makes many objects and hardly any garbage: by default much of the time goes to searching for it.
 gc.set_threshold(200_000, 20, 20)
 
 
