@@ -18,6 +18,7 @@ Word: TypeAlias = UInt32[Array, "*batch"]
 
 _ROTATIONS = (13, 15, 26, 6, 17, 29, 16, 24)
 _PARITY = np.uint32(0x1BD11BDA)
+_ULP = np.float32(2.0**-24)
 
 
 def random_bits(key: tuple[Word, Word], counter: tuple[Word, Word]) -> tuple[Word, Word]:
@@ -41,10 +42,10 @@ def standard_normals(
     Args:
       key: two words, such as a seed and a purpose.
       counter: two words, such as the number of a run and that of a step.
-      dtype: of the result. A float64 has 24 random bits too, so that both precisions see the same noise.
+      dtype: of the result. It is computed in float32, so that both precisions see the same noise.
     """
     a, b = random_bits(key, counter)
-    uniform, turn = ((word >> np.uint32(8)).astype(jnp.int32).astype(dtype) * 2.0**-24 for word in (a, b))
-    radius = jnp.sqrt(-2.0 * jnp.log(uniform + dtype.type(2.0**-25)))
-    sin, cos = sin_cos(2.0 * math.pi * turn - math.pi)
-    return radius * cos, radius * sin
+    uniform, turn = ((word >> np.uint32(8)).astype(jnp.int32).astype(jnp.float32) * _ULP for word in (a, b))
+    radius = jnp.sqrt(-2.0 * jnp.log(uniform + np.float32(2.0**-25)))
+    sin, cos = sin_cos(np.float32(2.0 * math.pi) * turn - np.float32(math.pi))
+    return (radius * cos).astype(dtype), (radius * sin).astype(dtype)
