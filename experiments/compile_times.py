@@ -2,9 +2,10 @@
 
     python experiments/compile_times.py
 
-Every case is compiled in fresh processes: cold, with an empty compilation cache, then warm, with what the cold one left
-there. All have 64 `hanging` starts, 3 s at 2 ms, float64, but the sweep, which has 4,096 and is timed by its calls: the
-first less the second. Gradients are in eight parameters of the corrected, centred law with pole placement.
+Every case is compiled in fresh processes: with nothing set; after `configure_cpu(gradients=True)` (the sweep after
+`configure_cpu()`) with an empty compilation cache; and once more with what that one left there, warm. All have 64
+`hanging` starts, 3 s at 2 ms, float64, but the sweep, which has 4,096 and is timed by its calls: the first less the
+second. Gradients are in eight parameters of the corrected, centred law with pole placement.
 """
 
 import dataclasses
@@ -124,14 +125,18 @@ def _phases(case: str) -> dict[str, float]:
     return dict(zip(("trace", "lower", "compile", "all"), [*phases, sum(phases)], strict=True))
 
 
-def _in_a_process(case: str, cache: str) -> dict[str, float]:
+def _in_a_process(case: str, cache: str, configured: bool) -> dict[str, float]:
     environment = os.environ | {
         "JAX_ENABLE_X64": "1",
         "JAX_COMPILATION_CACHE_DIR": cache,
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
     done = subprocess.run(
-        [sys.executable, __file__, "--measure", case], check=False, env=environment, capture_output=True, text=True
+        [sys.executable, __file__, "--measure", case, "configured" if configured else "bare"],
+        check=False,
+        env=environment,
+        capture_output=True,
+        text=True,
     )
     if done.returncode:
         raise RuntimeError(done.stderr)
@@ -141,17 +146,18 @@ def _in_a_process(case: str, cache: str) -> dict[str, float]:
 
 def main(out: Path, quick: bool = False, seed: int = 1, count: int = 3) -> list[dict[str, Any]]:
     """Prints the table, of medians over `count` laps, and writes compile_times.json."""
-    found: dict[str, list[tuple[dict[str, float], dict[str, float]]]] = {}
+    found: dict[str, list[tuple[dict[str, float], ...]]] = {}
     for _ in range(1 if quick else count):
         for case in ("lqr",) if quick else CASES:
-            with tempfile.TemporaryDirectory() as cache:
-                found.setdefault(case, []).append((_in_a_process(case, cache), _in_a_process(case, cache)))
+            with tempfile.TemporaryDirectory() as other, tempfile.TemporaryDirectory() as cache:
+                bare = _in_a_process(case, other, configured=False)
+                found.setdefault(case, []).append((bare, *(_in_a_process(case, cache, configured=True) for _ in "12")))
     rows: list[dict[str, Any]] = [
         {
             "case": case,
             **{
                 kept: {phase: statistics.median(lap[place][phase] for lap in laps) for phase in laps[0][place]}
-                for place, kept in enumerate(("cold", "warm"))
+                for place, kept in enumerate(("bare", "cold", "warm"))
             },
         }
         for case, laps in found.items()
@@ -160,20 +166,21 @@ def main(out: Path, quick: bool = False, seed: int = 1, count: int = 3) -> list[
     cells = [
         [
             row["case"],
+            f"{row['bare']['all']:.2f}",
             *(f"{row['cold'][p]:.2f}" if p in row["cold"] else "" for p in phases),
             f"{row['warm']['all']:.2f}",
         ]
         for row in rows
     ]
-    print_table("Compiling [s]", ("case", *phases, "all, warm"), cells, text_columns=1)
+    print_table("Compiling [s]", ("case", "all, bare", *phases, "all, warm"), cells, text_columns=1)
     files.write_json(out / "compile_times.json", {"versions": files.versions(), "rows": rows})
     return rows
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--measure"]:
-        if sys.argv[2] == "sweep":
-            cpjax.configure_cpu()
+        if sys.argv[3] == "configured":
+            cpjax.configure_cpu(gradients=sys.argv[2] != "sweep")
         print(json.dumps(_sweep() if sys.argv[2] == "sweep" else _phases(sys.argv[2])))
     else:
         run(main, __doc__ or "")

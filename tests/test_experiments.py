@@ -4,7 +4,11 @@ import importlib.util
 import sys
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
+
+import cpjax
 
 FOLDER = Path(__file__).parent.parent / "experiments"
 EXPERIMENTS = sorted(path for path in FOLDER.glob("*.py") if not path.name.startswith("_"))
@@ -66,3 +70,39 @@ def test_its_quick_mode_writes_its_json(experiment, tmp_path, capsys):
 
 def test_its_docstring_names_the_command_that_runs_it(experiment):
     assert f"python experiments/{experiment.__name__}.py" in experiment.__doc__
+
+
+def test_the_gradient_by_hand_in_c_is_that_of_jax(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER / "benchmark"))
+    import problem
+    import roofline
+
+    if roofline.compiler() is None:
+        pytest.skip("no C compiler")
+    plant, law = problem.problem()
+    hanging = cpjax.sample_starts("hanging", 8, seed=1)
+    starts = jax.tree.map(lambda column: np.concatenate([column, 0.1 * column]), hanging)
+    starts.theta[8:] += 0.1 * np.arange(8)
+    starts.theta[0], starts.theta_dot[0] = np.pi - 1e-3, 0.0  # within the radius of the kick
+    steps = 150
+    monkeypatch.setattr(roofline, "TRIAL_STEPS", 1000)
+    library, _ = roofline.build("float64", plant, law, starts, 1, roofline.GRADIENT)
+    travel, effort, found = roofline.run_gradient(library, plant, law, starts, steps, problem.DT)
+
+    def cost(law, start):
+        options = problem.settings(steps) | {"derivative": "pathwise"}
+        metrics = cpjax.measure(plant, law, start, **options)
+        return metrics.effort, metrics.cart_travel
+
+    (value, cart_travel), gradient = jax.jit(jax.vmap(jax.value_and_grad(cost, has_aux=True), (None, 0)))(law, starts)
+    np.testing.assert_allclose(travel, cart_travel, rtol=1e-12)
+    np.testing.assert_allclose(effort, value, rtol=1e-12)
+    swing_up = gradient.swing_up
+    K = np.moveaxis(gradient.regulator.K[:, 0], 1, 0)
+    numbers = dict(zip(("K0", "K1", "K2", "K3"), K, strict=True))
+    numbers |= {name: getattr(swing_up, name) for name in ("energy_gain", "cart_stiffness", "cart_damping", "kick")}
+    model = swing_up.model
+    numbers |= {"pivot_friction": model.pivot_friction, "cart_friction": model.cart_friction, "total": model.cart_mass}
+    for name, expected in numbers.items():
+        assert np.any(np.asarray(expected) != 0.0), name
+        np.testing.assert_allclose(found[name], expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)), err_msg=name)

@@ -1,4 +1,4 @@
-"""Configuration of JAX for CPUs: cores as devices, and two options of XLA's compiler.
+"""Configuration of JAX for CPUs: cores as devices, and four options of XLA's compiler.
 
 By default XLA's CPU compiler splits one step of a simulation into several functions, recomputes shared results in each,
 and calls them one after the other, which takes most of the time. `backend/single_kernel.py` avoids this without
@@ -6,6 +6,12 @@ options, but two compiler options are more effective for values (not for gradien
 
     xla_cpu_use_multi_output_fusion          what several results need is computed once
     xla_cpu_small_while_loop_byte_threshold  a whole loop becomes one function
+
+A step of a derivative is hundreds of short loops over the initial states. Unrolled, they are more code than the first
+cache holds, which takes longer to compile and to run. Two options serve both values and gradients:
+
+    xla_cpu_disable_loop_unrolling           loops stay short
+    xla_cpu_disable_slp_vectorizer           nothing is searched for vectors that the loops have already
 
 XLA does not document them, and they must be set before JAX starts, so a library should not set them unasked:
 `configure_cpu` sets them on request, and the command line sets them for itself. They change speed, and results in the
@@ -31,7 +37,8 @@ TESTED = ("0.10.2",)
 
 _CONFIG: Any = jax.config  # its attributes have no annotations
 
-_OPTIONS = "xla_cpu_use_multi_output_fusion=true,xla_cpu_small_while_loop_byte_threshold=16777216"
+_LESS_CODE = "xla_cpu_disable_loop_unrolling=true,xla_cpu_disable_slp_vectorizer=true"
+_FAST_VALUES = "xla_cpu_use_multi_output_fusion=true,xla_cpu_small_while_loop_byte_threshold=16777216"
 _FLAG = "--xla_backend_extra_options"
 
 
@@ -44,12 +51,12 @@ def configure_cpu(devices: int | None = None, *, gradients: bool = False) -> boo
     Args:
       devices: number of devices that the CPU appears as, among which `sweep` divides its initial states; by default
         the number of cores that this process may use.
-      gradients: for a process that computes values and gradients. The cores become devices, and the compiler keeps its
-        own options.
+      gradients: for a process that computes values and gradients: of the compiler's options, only those that shorten
+        its code are set.
 
     Returns:
-      Whether the compiler's options were set. They are not with `gradients`, with an untested jaxlib, or where
-        XLA_FLAGS has options of this kind already.
+      Whether the compiler's options were set. They are not with an untested jaxlib, or where XLA_FLAGS has options of
+        this kind already.
 
     Raises:
       InputError: `devices` is not a whole number of at least 1.
@@ -68,9 +75,10 @@ def configure_cpu(devices: int | None = None, *, gradients: bool = False) -> boo
     except RuntimeError as problem:
         message = "configure_cpu is too late: JAX has started. Call it before anything is computed with JAX"
         raise RuntimeError(message) from problem
-    if gradients or not jaxlib_is_tested() or _FLAG in flags:
+    if not jaxlib_is_tested() or _FLAG in flags:
         return False
-    os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}={_OPTIONS}".strip()
+    options = _LESS_CODE if gradients else f"{_FAST_VALUES},{_LESS_CODE}"
+    os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}={options}".strip()
     return True
 
 

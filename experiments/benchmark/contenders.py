@@ -107,11 +107,31 @@ def c_roofline(task: Task) -> Run:
     return run
 
 
+def c_gradient(task: Task) -> Run:
+    """Values and gradient by hand in C: see gradient.c. The effort and its derivatives in the law's numbers."""
+    import jax
+    import roofline
+
+    import cpjax
+
+    plant, controller = problem()
+    trial = jax.tree.map(np.asarray, cpjax.sample_starts("hanging", task.starts, seed=task.seed))
+    trial = jax.tree.map(lambda column: np.asarray(column, task.dtype), trial)
+    library, form = roofline.build(task.dtype, plant, controller, trial, task.cores, roofline.GRADIENT)
+
+    def run(starts: Any, steps: int) -> Any:
+        return roofline.run_gradient(library, plant, controller, starts, steps, DT)[0]
+
+    run.form = form.words  # type: ignore[attr-defined]  # a function may have attributes
+    return run
+
+
 LONG_STEPS: dict[str, Any] = {"dt": 0.01, "clock": "continuous", "switching": "located"}
 
 CONTENDERS: dict[str, tuple[Callable[[Task], Run], str]] = {
     "C": (c_roofline, "by hand in C"),
     "C, one start": (c_roofline, "by hand in C, compiled for one start"),
+    "C, gradient": (c_gradient, "the effort and its gradient in the law's numbers, by hand in C"),
     "cpjax": (cpjax_sweep, "metrics"),
     "cpjax, no options": (cpjax_sweep, "metrics, on as many devices but without options of the compiler"),
     "cpjax, every 10th sample": (partial(cpjax_sweep, save_every=10), "trajectories"),
@@ -121,8 +141,13 @@ CONTENDERS: dict[str, tuple[Callable[[Task], Run], str]] = {
     "cpjax, one start, 10 ms": (partial(cpjax_one, compiled=True, **LONG_STEPS), "continuous clock, steps of 10 ms"),
     "cpjax, values of 64": (partial(cpjax_gradient, reverse=False), "a cost, under vmap"),
     "cpjax, gradient": (cpjax_gradient, "a cost and its gradient, reverse mode"),
+    "cpjax, values of 64, less code": (partial(cpjax_gradient, reverse=False), "after configure_cpu(gradients=True)"),
+    "cpjax, gradient, less code": (cpjax_gradient, "the same after cpjax.configure_cpu(gradients=True)"),
     "cpjax, gradient with options": (cpjax_gradient, "the same after cpjax.configure_cpu"),
-    "cpjax, gradient, every step": (partial(cpjax_gradient, checkpoint="every_step"), "likewise, more remembered"),
+    "cpjax, gradient, less code, every step": (
+        partial(cpjax_gradient, checkpoint="every_step"),
+        "likewise, more remembered",
+    ),
     "plain JAX scan": (plain_scan, "lax.scan under vmap, largest |x| only"),
     "diffrax, Heun": (diffrax_steps, "2nd order, continuous clock, no metrics"),
     "diffrax, Tsit5": (partial(diffrax_steps, solver="Tsit5"), "5th order, continuous clock, no metrics"),
@@ -152,8 +177,8 @@ def measure(name: str, task: Task) -> dict[str, Any]:
     jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # untyped in JAX
     import cpjax
 
-    if name in CONFIGURED:
-        cpjax.configure_cpu(devices=task.cores)
+    if name in CONFIGURED or "less code" in name:
+        cpjax.configure_cpu(devices=task.cores, gradients="less code" in name)
     else:
         jax.config.update("jax_num_cpu_devices", task.cores)  # type: ignore[no-untyped-call]  # untyped in JAX
     starts = jax.tree.map(

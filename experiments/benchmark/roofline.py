@@ -1,4 +1,4 @@
-"""Compiles `roofline.c` with the system's compiler, in each of its forms, and calls the one that is fastest here."""
+"""Compiles `roofline.c` and `gradient.c` with the system's compiler, in each of their forms, and calls the fastest."""
 
 import ctypes
 import hashlib
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from cpjax.backend.runtime import instruction_set
 from cpjax.controllers import AngleRateGate, EnergySwingUp, Hybrid, StateFeedback
@@ -22,12 +23,29 @@ from cpjax.plant import CartPole
 from cpjax.plant.state import State
 from cpjax.sim.metrics import Metrics, ProtocolMetrics
 
-SOURCE = Path(__file__).with_name("roofline.c")
+FOLDER = Path(__file__).parent
+VALUES, GRADIENT = FOLDER / "roofline.c", FOLDER / "gradient.c"
 FLAGS = ["-O3", "-march=native", "-ffp-contract=fast", "-fopenmp", "-shared", "-fPIC", "-Wno-psabi"]
 TRIALS = 5
 TRIAL_STEPS = 4_000_000
 """Steps of a trial, all starts together."""
 BUILT = Path(__file__).parents[2] / "build" / "roofline"
+
+
+NUMBERS = (
+    *("energy_gain", "cart_stiffness", "cart_damping", "kick", "K0", "K1", "K2", "K3"),
+    *(
+        "pivot_inertia",
+        "weight",
+        "ml",
+        "pivot_friction",
+        "total",
+        "cart_friction",
+        "motor_damping",
+        "force_per_voltage",
+    ),
+)
+"""Numbers of the law and its model in which `gradient.c` differentiates, in its order."""
 
 
 class Form(NamedTuple):
@@ -56,21 +74,26 @@ def compiler() -> str | None:
     return shutil.which(os.environ.get("CC", "cc"))
 
 
-def build(dtype: str, plant: CartPole, controller: Hybrid, starts: State, threads: int) -> tuple[ctypes.CDLL, Form]:
+def build(
+    dtype: str, plant: CartPole, controller: Hybrid, starts: State, threads: int, source: Path = VALUES
+) -> tuple[ctypes.CDLL, Form]:
     """Returns the fastest of all forms for "float32" or "float64" on this machine, and which it is.
 
     All are compiled and timed with these starts once; libraries and choice are kept in build/.
+
+    Args:
+      source: `VALUES` or `GRADIENT`, which has one form less: it does all vectors of a block in one pass.
     """
     cc = compiler()
     if cc is None:
         raise FileNotFoundError("no C compiler")
     count = int(np.shape(starts.x)[0])
-    forms = [
-        Form(*form) for form in itertools.product((False, True), (16, 32, 64), (1,) if count == 1 else (2, 8, 16, 32))
-    ]
+    passes, counts = ((False, True), (2, 8, 16, 32)) if source == VALUES else ((True,), (1, 2, 4, 8))
+    forms = [Form(*form) for form in itertools.product(passes, (16, 32, 64), (1,) if count == 1 else counts)]
     release = subprocess.run([cc, "--version"], capture_output=True, text=True, check=True).stdout
     key = (instruction_set(), release, *FLAGS, dtype, str(count), str(threads), repr(forms), str(TRIAL_STEPS))
-    folder = BUILT / hashlib.sha256("\n".join((SOURCE.read_text(), *key)).encode()).hexdigest()[:16]
+    code = source.read_text() + VALUES.read_text()
+    folder = BUILT / hashlib.sha256("\n".join((code, *key)).encode()).hexdigest()[:16]
     if not folder.exists():
         BUILT.mkdir(parents=True, exist_ok=True)
         begun = Path(tempfile.mkdtemp(dir=BUILT))
@@ -78,16 +101,23 @@ def build(dtype: str, plant: CartPole, controller: Hybrid, starts: State, thread
 
         def made(form: Form) -> ctypes.CDLL:
             library = _library(begun, form)
-            subprocess.run([cc, *FLAGS, *kind, *form.flags, str(SOURCE), "-o", str(library)], check=True)
+            subprocess.run([cc, *FLAGS, *kind, *form.flags, str(source), "-o", str(library)], check=True)
             return ctypes.CDLL(str(library))
+
+        def timed(form: Form) -> float:
+            begin = time.perf_counter()
+            steps = TRIAL_STEPS // count
+            if source == VALUES:
+                run(libraries[form], plant, controller, starts, steps, 2e-3, threads)
+            else:
+                run_gradient(libraries[form], plant, controller, starts, min(steps, 5000), 2e-3)
+            return time.perf_counter() - begin
 
         with ThreadPoolExecutor() as pool:
             libraries = dict(zip(forms, pool.map(made, forms), strict=True))
         seconds = dict.fromkeys(forms, math.inf)
         for form in forms * TRIALS:
-            begin = time.perf_counter()
-            run(libraries[form], plant, controller, starts, TRIAL_STEPS // count, 2e-3, threads)
-            seconds[form] = min(seconds[form], time.perf_counter() - begin)
+            seconds[form] = min(seconds[form], timed(form))
         (begun / "chosen.json").write_text(json.dumps(min(forms, key=lambda form: seconds[form])))
         try:
             begun.rename(folder)
@@ -109,9 +139,7 @@ def run(
     Args:
       starts: of arrays (n,) in the library's dtype.
     """
-    columns = np.ascontiguousarray(
-        np.stack([np.asarray(getattr(starts, name)) for name in starts.__dataclass_fields__])
-    )
+    columns = _columns(starts)
     dtype, count = columns.dtype, columns.shape[1]
     results = np.empty((9, count), dtype)
     parameters = np.asarray(_parameters(plant, controller, dt), dtype)
@@ -121,6 +149,28 @@ def run(
     rows[0] = rows[0] != 0
     rows[7:] = [row.astype(np.int32) for row in rows[7:]]
     return Metrics(*rows)
+
+
+def run_gradient(
+    library: ctypes.CDLL, plant: CartPole, controller: Hybrid, starts: State, steps: int, dt: float
+) -> tuple[Float[np.ndarray, " starts"], Float[np.ndarray, " starts"], dict[str, Float[np.ndarray, " starts"]]]:
+    """Returns how far every cart goes on the sampled clock, the effort, and its derivatives by the number's name.
+
+    Args:
+      starts: of arrays (n,) in the library's dtype.
+    """
+    columns = _columns(starts)
+    count = columns.shape[1]
+    results = np.empty((2 + len(NUMBERS), count), columns.dtype)
+    parameters = np.asarray(_parameters(plant, controller, dt), columns.dtype)
+    pointers = [ctypes.c_void_p(array.ctypes.data) for array in (parameters, columns, results)]
+    if library.gradient(pointers[0], ctypes.c_long(count), ctypes.c_long(steps), *pointers[1:]):
+        raise MemoryError("gradient.c: no memory for what it keeps of each step")
+    return results[0], results[1], dict(zip(NUMBERS, results[2:], strict=True))
+
+
+def _columns(starts: State) -> Float[np.ndarray, "components starts"]:
+    return np.ascontiguousarray(np.stack([np.asarray(getattr(starts, name)) for name in starts.__dataclass_fields__]))
 
 
 def _parameters(plant: CartPole, controller: Hybrid, dt: float) -> list[float]:

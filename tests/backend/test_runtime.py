@@ -37,8 +37,12 @@ def test_by_default_each_core_of_the_process_is_a_device():
     assert in_a_process()[1] == str(len(os.sched_getaffinity(0)))
 
 
-def test_for_gradients_cores_become_devices_and_the_compiler_keeps_its_options():
-    assert in_a_process("devices=2, gradients=True") == ["False", "2", "False"]
+def test_for_gradients_cores_become_devices_and_loops_stay_as_they_are():
+    done, devices, fast, flags = in_a_process("devices=2, gradients=True")
+    assert (done, devices, fast) == ("True", "2", "False")
+    assert flags == (
+        "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling=true,xla_cpu_disable_slp_vectorizer=true"
+    )
 
 
 def test_another_jaxlib_than_the_tested_ones_keeps_its_own_options():

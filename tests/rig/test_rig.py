@@ -112,7 +112,8 @@ def test_the_noise_is_threefry_and_normal():
         assert float(jnp.mean(one**4)) == pytest.approx(3.0, abs=0.1)
     assert abs(float(jnp.mean(a * b))) < 5.0 / math.sqrt(200_000)
     for one, other in zip(standard_normals(key, many, np.dtype(np.float32)), (a, b), strict=True):
-        assert one.dtype == np.float32 and np.array_equal(one, other)
+        assert one.dtype == np.float32
+        assert np.array_equal(one, other)
 
 
 @pytest.mark.parametrize(
