@@ -5,8 +5,9 @@
 Values: the settling time of 192 starts, 5 s, a control held over 4 ms, as a search without gradients asks for them.
 With a gradient: a step of `cpjax tune` with 8 controllers and 16 starts each, 3 s at 20 ms, located
 switching, in the same nine parameters. And a step of `cpjax pareto`: time and all costs at once, as many controllers
-as one core has, 8 starts each, 8 s, the supply a parameter of each. Each runs with and without two options of XLA's
-CPU compiler, each combination in a process of its own, and all processes in turn; the best of each counts.
+as one core has, 8 starts each, 8 s, the supply a parameter of each. Each runs without options of XLA's CPU
+compiler, with those of `configure_cpu(gradients=True)` and with those of `configure_cpu()`, each combination in a
+process of its own, and all processes in turn; the best of each counts.
 """
 
 import itertools
@@ -36,8 +37,9 @@ from cpjax.tune.baseline import baseline
 from cpjax.tune.config import TuningConfig
 from cpjax.tune.parameters import free_parameters
 
-FUSION, LOOPS = "xla_cpu_use_multi_output_fusion=true", "xla_cpu_small_while_loop_byte_threshold=16777216"
-OPTIONS = {"none": "", "fusion and small loops": f"{FUSION},{LOOPS}"}
+LESS_CODE = "xla_cpu_disable_loop_unrolling=true,xla_cpu_disable_slp_vectorizer=true"
+FAST_VALUES = "xla_cpu_use_multi_output_fusion=true,xla_cpu_small_while_loop_byte_threshold=16777216"
+OPTIONS = {"none": "", "less code": LESS_CODE, "all": f"{FAST_VALUES},{LESS_CODE}"}
 WORK = ("values", "gradients", "fronts")
 
 
