@@ -140,17 +140,7 @@ INLINE void transpose_step(const parameters *p, const constants *k, const kept *
    Returns 0, or 1 where memory is short. */
 int gradient(const parameters *given, long n, long steps, const real *starts, real *results) {
     const parameters p = *given;
-    const constants k = {
-        .total = p.mass + p.pole_mass,
-        .fixed = (p.mass + p.pole_mass) * p.pole_inertia + p.ml * p.pole_length * p.mass,
-        .turning = p.ml * p.pole_length * p.pole_mass,
-        .per_weight = 1 / p.weight,
-        .per_edge = 1 / p.kick_edge,
-        .per_gate_edge = 1 / p.gate_edge,
-        .per_gate_rate = 1 / p.gate_rate,
-        .per_inertia = 1 / p.pivot_inertia,
-        .per_force = 1 / p.force_per_voltage,
-    };
+    const constants k = following(given);
     kept *tape = aligned_alloc(64, sizeof(kept) * VECTORS * (size_t)steps);
     if (!tape) return 1;
     for (long first = 0; first < n; first += LANES) {

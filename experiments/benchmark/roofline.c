@@ -102,6 +102,21 @@ typedef struct {
     real total, fixed, turning, per_weight, per_edge, per_gate_edge, per_gate_rate, per_inertia, per_force;
 } constants;
 
+/* Returns what follows from the parameters. */
+INLINE constants following(const parameters *p) {
+    return (constants){
+        .total = p->mass + p->pole_mass,
+        .fixed = (p->mass + p->pole_mass) * p->pole_inertia + p->ml * p->pole_length * p->mass,
+        .turning = p->ml * p->pole_length * p->pole_mass,
+        .per_weight = 1 / p->weight,
+        .per_edge = 1 / p->kick_edge,
+        .per_gate_edge = 1 / p->gate_edge,
+        .per_gate_rate = 1 / p->gate_rate,
+        .per_inertia = 1 / p->pivot_inertia,
+        .per_force = 1 / p->force_per_voltage,
+    };
+}
+
 /* One vector of starts. */
 typedef struct {
     vec x, x_dot, theta, theta_dot, voltage;
@@ -291,17 +306,7 @@ static void simulate(const parameters *p, const constants *k, long steps, lanes 
 /* Starts: (4, n). Results: (9, n), in the order of cpjax.Metrics, as real numbers. */
 void roofline(const parameters *given, long n, long steps, const real *starts, real *results, int threads) {
     const parameters p = *given;
-    const constants k = {
-        .total = p.mass + p.pole_mass,
-        .fixed = (p.mass + p.pole_mass) * p.pole_inertia + p.ml * p.pole_length * p.mass,
-        .turning = p.ml * p.pole_length * p.pole_mass,
-        .per_weight = 1 / p.weight,
-        .per_edge = 1 / p.kick_edge,
-        .per_gate_edge = 1 / p.gate_edge,
-        .per_gate_rate = 1 / p.gate_rate,
-        .per_inertia = 1 / p.pivot_inertia,
-        .per_force = 1 / p.force_per_voltage,
-    };
+    const constants k = following(given);
     const real end = (real)steps * p.dt;
     const long blocks = (n + LANES - 1) / LANES;
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
