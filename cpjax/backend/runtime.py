@@ -2,13 +2,13 @@
 
 By default XLA's CPU compiler splits one step of a simulation into several functions, recomputes shared results in each,
 and calls them one after the other, which takes most of the time. `backend/single_kernel.py` avoids this without
-options, but two compiler options are more effective for values (not for gradients):
+options, but two compiler options are more effective:
 
     xla_cpu_use_multi_output_fusion          what several results need is computed once
     xla_cpu_small_while_loop_byte_threshold  a whole loop becomes one function
 
 A step of a derivative is hundreds of short loops over the initial states. Unrolled, they are more code than the first
-cache holds, which takes longer to compile and to run. Two options serve both values and gradients:
+cache holds, which takes longer to compile and to run. Two more options prevent that:
 
     xla_cpu_disable_loop_unrolling           loops stay short
     xla_cpu_disable_slp_vectorizer           nothing is searched for vectors that the loops have already
@@ -37,22 +37,22 @@ TESTED = ("0.10.2",)
 
 _CONFIG: Any = jax.config  # its attributes have no annotations
 
-_LESS_CODE = "xla_cpu_disable_loop_unrolling=true,xla_cpu_disable_slp_vectorizer=true"
-_FAST_VALUES = "xla_cpu_use_multi_output_fusion=true,xla_cpu_small_while_loop_byte_threshold=16777216"
+_OPTIONS = (
+    "xla_cpu_use_multi_output_fusion=true,xla_cpu_small_while_loop_byte_threshold=16777216,"
+    "xla_cpu_disable_loop_unrolling=true,xla_cpu_disable_slp_vectorizer=true"
+)
 _FLAG = "--xla_backend_extra_options"
 
 
 def configure_cpu(devices: int | None = None, *, gradients: bool = False) -> bool:
     """Configures JAX for fast simulations of many initial states on a CPU.
 
-    Call it once, before JAX computes anything. By default it optimises values: gradients become slower, those through a
-    trajectory much slower (docs/performance.md).
+    Call it once, before JAX computes anything. Values, gradients and compiling become faster (docs/performance.md).
 
     Args:
       devices: number of devices that the CPU appears as, among which `sweep` divides its initial states; by default
         the number of cores that this process may use.
-      gradients: for a process that computes values and gradients: of the compiler's options, only those that shorten
-        its code are set.
+      gradients: without effect; accepted until the next version, because gradients once needed other options.
 
     Returns:
       Whether the compiler's options were set. They are not with an untested jaxlib, or where XLA_FLAGS has options of
@@ -77,8 +77,7 @@ def configure_cpu(devices: int | None = None, *, gradients: bool = False) -> boo
         raise RuntimeError(message) from problem
     if not jaxlib_is_tested() or _FLAG in flags:
         return False
-    options = _LESS_CODE if gradients else f"{_FAST_VALUES},{_LESS_CODE}"
-    os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}={options}".strip()
+    os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}={_OPTIONS}".strip()
     return True
 
 

@@ -65,6 +65,11 @@ def outline(function: Callable[..., Any]) -> Callable[..., Any]:
     return function if runtime.compiler_fuses_loops() else _called(function, _part, False)
 
 
+def is_identity(primitive: Any) -> bool:
+    """Returns whether an operation is one of this module's marks, which return each argument as it is."""
+    return any(primitive in (marks.results, marks.arguments, marks.cotangents) for marks in (_whole, _part))
+
+
 class _Marks:
     """Three identity primitives. `results` marks the call whose results it receives. `arguments`, applied to a call's
     arguments, becomes `cotangents` in a reverse pass, where the cotangents are results of the call's transpose."""
@@ -73,7 +78,7 @@ class _Marks:
         self.results: Any = Primitive(f"results_of_{kind}")
         self.arguments: Any = Primitive(f"arguments_of_{kind}")
         self.cotangents: Any = Primitive(f"cotangents_of_{kind}")
-        _define(self.results, self.results)
+        _define(self.results, None)
         _define(self.arguments, self.cotangents)
         _define(self.cotangents, self.arguments)
 
@@ -128,7 +133,9 @@ def _define(primitive: Any, transpose: Any) -> None:
     primitive.def_abstract_eval(lambda *values: list(values))
     batching.primitive_batchers[primitive] = lambda values, axes: (primitive.bind(*values), axes)
     ad.primitive_jvps[primitive] = jvp
-    ad.primitive_transposes[primitive] = lambda cotangents, *_: bind_nonzero(transpose, cotangents)
+    ad.primitive_transposes[primitive] = lambda cotangents, *_: (
+        bind_nonzero(transpose, cotangents) if transpose else list(cotangents)
+    )
     mlir.register_lowering(primitive, lambda _, *values: list(values))
 
 

@@ -43,7 +43,6 @@ _COS_32 = (4.166664568298827e-2, -1.388731625493765e-3, 2.443315711809948e-5)
 _Pair: TypeAlias = tuple[jax.Array, jax.Array]
 
 
-@jax.custom_jvp
 def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
     """Computes sine and cosine of `angle`, accurate to 2 ulp of 1 for |angle| <= 1e4.
 
@@ -57,6 +56,12 @@ def sin_cos(angle: Scalar) -> tuple[jax.Array, jax.Array]:
     """
     angle = jnp.asarray(angle)
     angle = angle.astype(jnp.result_type(angle, float)) if not jnp.issubdtype(angle.dtype, jnp.floating) else angle
+    sin, cos = _compiled(angle)
+    return sin, cos
+
+
+@jax.custom_jvp
+def _sin_cos(angle: jax.Array) -> _Pair:
     s, c, quadrant = outline(_reduced)(angle)
     odd = (quadrant & 1) == 1
     sin, cos = lax.select(odd, c, s), lax.select(odd, s, c)
@@ -76,11 +81,15 @@ def _reduced(angle: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     return s, c, quadrant
 
 
-@sin_cos.defjvp
+@_sin_cos.defjvp
 def _sin_cos_jvp(primals: tuple[Scalar], tangents: tuple[jax.Array]) -> tuple[_Pair, _Pair]:
     (angle,), (tangent,) = primals, tangents
-    sin, cos = sin_cos(angle)
+    sin, cos = _compiled(angle)
     return (sin, cos), (cos * tangent, -sin * tangent)
+
+
+# JAX traces it once, so that two calls on one angle are seen to be equal: see `sim/invariants.py`.
+_compiled = jax.jit(_sin_cos)
 
 
 LARGEST_TURN = 0.1

@@ -126,10 +126,7 @@ def _run(arguments: list[str], set_up: bool) -> int:
         from cpjax.backend import runtime
 
         runtime.keep_compilations()
-        if getattr(options, "many_starts", False):
-            runtime.configure_cpu()
-        else:
-            runtime.configure_cpu(1, gradients=True)
+        runtime.configure_cpu(None if getattr(options, "many_starts", False) else 1)
         startup.ready()  # until here an interrupt ends the process at once: nothing has been written
         if not sys.warnoptions:  # those that matter are in the results, as a flag, or in an error
             warnings.simplefilter("ignore")

@@ -14,7 +14,6 @@ import numpy as np
 from jax.extend.core import Literal
 from jaxtyping import Array, Float, Int
 
-from cpjax.backend import runtime
 from cpjax.backend.single_kernel import outline, single_kernel
 from cpjax.checks import arrays, call, like
 from cpjax.numeric.selection import where
@@ -112,9 +111,7 @@ def _run(
         return carry, pack(_saved(instant.plant, sample, loop), plant)
 
     if every is None:
-        # With these compiler options, all that is stored for reverse mode would be copied at each step.
-        checkpoint = "segments" if runtime.compiler_fuses_loops() else settings.checkpoint
-        return scan(body, carry, jnp.arange(steps), checkpoint)
+        return scan(body, carry, jnp.arange(steps), settings.checkpoint)
     if every == 1:
         return scan(body, carry, jnp.arange(steps), "every_step")
     return scan(block, carry, jnp.arange(0, steps, every), "every_step")

@@ -1,4 +1,4 @@
-"""Scan with checkpointing, which bounds the memory of reverse mode."""
+"""Scan with checkpointing, which bounds the memory of reverse mode, and with invariants moved out of the loop."""
 
 import math
 from collections.abc import Callable
@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
+from cpjax.backend.stacks import apart, together
+from cpjax.sim.invariants import hoisted
 from cpjax.sim.settings import Checkpoint
 
 
@@ -23,7 +25,18 @@ def scan(body: Callable[[Any, Any], Any], carry: Any, xs: Int[Array, " steps"], 
         recomputed: memory grows with sqrt(n), and each step is computed three times. "every_step": all of them, so that
         each step is computed twice.
     """
-    body = jax.checkpoint(body, prevent_cse=False)
+    step = hoisted(body, carry, xs[0])
+
+    def step_of_leaves(leaves: Any, x: Any) -> tuple[Any, Any]:
+        after, y = step(together(leaves, carry), x)
+        return apart(after), y
+
+    leaves, ys = _scan(jax.checkpoint(step_of_leaves, prevent_cse=False), apart(carry), xs, checkpoint)
+    return together(leaves, carry), ys
+
+
+def _scan(body: Callable[[Any, Any], Any], carry: Any, xs: Int[Array, " steps"], checkpoint: Checkpoint) -> Any:
+    """Computes `lax.scan(body, carry, xs)`, in segments whose inner carries are recomputed if `checkpoint` says so."""
     if checkpoint == "every_step":
         return lax.scan(body, carry, xs)
     length = _segment(xs.shape[0])

@@ -36,7 +36,7 @@ class Simulation(TypedDict, total=False):
         more is stopped and flagged. By default 64 plus a sixteenth of the steps.
       checkpoint: what reverse mode stores: the state at the ends of "segments" of about sqrt(n) steps, or at
         "every_step", which takes more memory. Nothing else depends on it. (With switching per step, `rollout` stores
-        the saved states regardless of it, and `measure` after `cpjax.configure_cpu` always "segments".)
+        the saved states regardless of it.)
       derivative: where the instant of a change of mode does not move with the parameters, because it falls on a control
         instant, "pathwise" omits its effect; "mean", on the sampled clock, adds it: the result is the derivative of the
         mean over initial states (see docs/gradients.md). Without either, differentiating such a loop warns.
