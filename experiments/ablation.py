@@ -3,8 +3,8 @@
     python experiments/ablation.py
 
 Each part is taken out in a process of its own, by replacing it with what anybody would write first, and the cases of
-`speed_against.py` are run in turn with and without it: with the compiler's options that `configure_cpu` sets, and with
-`configure_cpu(gradients=True)`, which leaves them as they are. Prints the median ratio of neighbouring laps: by how
+`speed_against.py` are run in turn with and without it: with the compiler's options that `configure_cpu` sets, and
+without. Prints the median ratio of neighbouring laps: by how
 much the part makes the case faster. A part that gains less than 5 % everywhere should go.
 """
 
@@ -25,7 +25,7 @@ from cpjax import files
 from cpjax.cli.tables import print_table
 
 CASES = {
-    True: ("sweep of 4096, float32", "sweep of 65536, float32", "sweep of 65536, float64", "one measure under jit"),
+    True: ("sweep of 4096, float32", "sweep of 65536, float64", "gradient of 64", "located gradient of 64"),
     False: ("sweep of 4096, float32", "gradient of 64", "located gradient of 64", "one measure under jit"),
 }
 """By whether the compiler's options are set."""
@@ -77,10 +77,21 @@ def _sin_cos() -> None:
     replace(modules, "sin_cos", lambda angle: (jnp.sin(angle), jnp.cos(angle)))
 
 
+def _invariants() -> None:
+    replace("sim.scan", "hoisted", lambda function, *_: function)
+
+
+def _stacks() -> None:
+    replace("sim.scan", "apart", jax.tree.leaves)
+    replace("sim.scan", "together", lambda leaves, like: jax.tree.unflatten(jax.tree.structure(like), leaves))
+
+
 PARTS: dict[str, Callable[[], Any]] = {
     "loops as one function": lambda: replace("backend.single_kernel", "_called", lambda function, *_: function),
     "parts of a step as functions": _outline,
+    "stacks of shapes of their own": _stacks,
     "own sine and cosine": _sin_cos,
+    "invariants outside the loop": _invariants,
     "angles turned between stages": _incremental,
     "failures outside the loop": _fast_path,
     "results of a kind in one array": _stacked,

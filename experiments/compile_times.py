@@ -2,10 +2,10 @@
 
     python experiments/compile_times.py
 
-Every case is compiled in fresh processes: with nothing set; after `configure_cpu(gradients=True)` (the sweep after
-`configure_cpu()`) with an empty compilation cache; and once more with what that one left there, warm. All have 64
-`hanging` starts, 3 s at 2 ms, float64, but the sweep, which has 4,096 and is timed by its calls: the first less the
-second. Gradients are in eight parameters of the corrected, centred law with pole placement.
+Every case is compiled in fresh processes: with nothing set; after `configure_cpu()` with an empty compilation cache;
+and once more with what that one left there, warm. All have 64 `hanging` starts, 3 s at 2 ms, float64, but the sweep,
+which has 4,096 and is timed by its calls: the first less the second. Gradients are in eight parameters of the
+corrected, centred law with pole placement.
 """
 
 import dataclasses
@@ -180,7 +180,7 @@ def main(out: Path, quick: bool = False, seed: int = 1, count: int = 3) -> list[
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--measure"]:
         if sys.argv[3] == "configured":
-            cpjax.configure_cpu(gradients=sys.argv[2] != "sweep")
+            cpjax.configure_cpu()
         print(json.dumps(_sweep() if sys.argv[2] == "sweep" else _phases(sys.argv[2])))
     else:
         run(main, __doc__ or "")

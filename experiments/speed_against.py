@@ -5,8 +5,7 @@
 Checks the older commit out beside this one and gives each a process of its own, which stays. Every case is compiled in
 both and then run in turn, old, new, new, old, so that a busy machine disturbs both alike. Prints the medians and the
 median ratio of neighbouring laps: above 1 this commit is faster. The cases name every argument: defaults may differ.
-Sweeps and single runs come after `configure_cpu()`; gradients after it and after `configure_cpu(gradients=True)`,
-which leaves the compiler's options as they are.
+Each case comes after `configure_cpu()`, and once more with nothing set but the devices.
 """
 
 import argparse
@@ -30,13 +29,16 @@ Cases = dict[str, tuple[Callable[[], Any], float, int]]
 
 def cases(configured: bool = True) -> Cases:
     """Returns the cases with the package that this process has imported, with or without the compiler's options."""
-    import cpjax
-
-    cpjax.configure_cpu(**{} if configured else {"gradients": True})
     import jax
     import jax.numpy as jnp
 
+    import cpjax
     from cpjax import paper
+
+    if configured:
+        cpjax.configure_cpu()
+    else:
+        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)  # type: ignore[no-untyped-call]  # untyped in JAX
 
     jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # untyped in JAX
     plant = paper.appendix_plant()

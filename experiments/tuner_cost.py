@@ -5,9 +5,8 @@
 Values: the settling time of 192 starts, 5 s, a control held over 4 ms, as a search without gradients asks for them.
 With a gradient: a step of `cpjax tune` with 8 controllers and 16 starts each, 3 s at 20 ms, located
 switching, in the same nine parameters. And a step of `cpjax pareto`: time and all costs at once, as many controllers
-as one core has, 8 starts each, 8 s, the supply a parameter of each. Each runs without options of XLA's CPU
-compiler, with those of `configure_cpu(gradients=True)` and with those of `configure_cpu()`, each combination in a
-process of its own, and all processes in turn; the best of each counts.
+as one core has, 8 starts each, 8 s, the supply a parameter of each. Each runs with nothing set and after
+`configure_cpu(1)`, each combination in a process of its own, and all processes in turn; the best of each counts.
 """
 
 import itertools
@@ -25,6 +24,7 @@ import numpy as np
 from _common import run
 
 from cpjax import files, paper
+from cpjax.backend import configure_cpu
 from cpjax.cli.tables import print_table
 from cpjax.plant.initial_states import sample_starts
 from cpjax.plant.state import State
@@ -37,9 +37,7 @@ from cpjax.tune.baseline import baseline
 from cpjax.tune.config import TuningConfig
 from cpjax.tune.parameters import free_parameters
 
-LESS_CODE = "xla_cpu_disable_loop_unrolling=true,xla_cpu_disable_slp_vectorizer=true"
-FAST_VALUES = "xla_cpu_use_multi_output_fusion=true,xla_cpu_small_while_loop_byte_threshold=16777216"
-OPTIONS = {"none": "", "less code": LESS_CODE, "all": f"{FAST_VALUES},{LESS_CODE}"}
+OPTIONS = ("nothing", "configure_cpu")
 WORK = ("values", "gradients", "fronts")
 
 
@@ -59,7 +57,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
         [*(str(row[key]) for key in ("design", "work", "options")), f"{row['million_steps_per_second']:.2f}"]
         for row in rows
     ]
-    print_table("Speed", ("design", "work", "options", "M steps/s"), cells, text_columns=3)
+    print_table("Speed", ("design", "work", "set before", "M steps/s"), cells, text_columns=3)
     weights = {}
     for design in () if quick else get_args(paper.Design):
         best = {
@@ -74,9 +72,7 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
 def _in_a_process(design: str, work: str, options: str, quick: bool) -> float:
     """Steps per second."""
     environment = os.environ | {"JAX_ENABLE_X64": "1"}
-    if OPTIONS[options]:
-        environment["XLA_FLAGS"] = f"--xla_backend_extra_options={OPTIONS[options]}"
-    command = [sys.executable, __file__, "--measure", design, work, "quick" if quick else "whole"]
+    command = [sys.executable, __file__, "--measure", design, work, options, "quick" if quick else "whole"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     return float(json.loads(done.stdout))
 
@@ -136,6 +132,8 @@ def _measure_fronts(plant: Any, design: Any, quick: bool) -> float:
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--measure"]:
-        print(json.dumps(_measure(sys.argv[2], sys.argv[3], sys.argv[4] == "quick")))
+        if sys.argv[4] == "configure_cpu":
+            configure_cpu(1)
+        print(json.dumps(_measure(sys.argv[2], sys.argv[3], sys.argv[5] == "quick")))
     else:
         run(main, __doc__ or "")

@@ -6,13 +6,14 @@ within one second, before runs part by what rounding does to them.
 """
 
 import argparse
+import dataclasses
 import json
 import os
 import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from peers import (
@@ -60,28 +61,53 @@ def cpjax_one(task: Task, compiled: bool = False, **other: Any) -> Run:
     return run
 
 
-def cpjax_gradient(task: Task, reverse: bool = True, checkpoint: Any = "segments") -> Run:
-    """The mean voltage variation and, in reverse mode, its gradient in all of the controller's numbers."""
+class EffortAndTravel(NamedTuple):
+    """The metrics of gradient.c: the integral of u^2 dt, and the largest abs(x), which is not differentiated."""
+
+    def init(self, sample: Any) -> Any:
+        return 0.0 * sample.time, 0.0 * sample.time
+
+    def update(self, state: Any, sample: Any) -> Any:
+        import jax
+        import jax.numpy as jnp
+
+        effort, travel = state
+        effort = effort + sample.elapsed * sample.voltage_since * sample.voltage_since
+        return effort, jnp.maximum(travel, jnp.abs(jax.lax.stop_gradient(sample.state.x)))
+
+    def finalize(self, state: Any, last: Any) -> Any:
+        return state
+
+
+def cpjax_gradient(task: Task, reverse: bool = True, checkpoint: Any = "segments", few: bool = False) -> Run:
+    """The mean effort and, in reverse mode, its gradient in all of the controller's numbers, or in gain and K alone."""
     import jax
 
     import cpjax
 
     plant, controller = problem()
+    numbers = (controller.swing_up.energy_gain, controller.regulator.K) if few else controller
 
-    def cost(controller: Any, starts: Any, steps: int) -> Any:
-        options = settings(steps) | {"checkpoint": checkpoint, "derivative": "pathwise"}
-        metrics = jax.vmap(lambda start: cpjax.measure(plant, controller, start, **options))(starts)
-        return metrics.effort.mean(), metrics.cart_travel
+    def law(numbers: Any) -> Any:
+        if not few:
+            return numbers
+        swing_up = dataclasses.replace(controller.swing_up, energy_gain=numbers[0])
+        return dataclasses.replace(controller, swing_up=swing_up, regulator=cpjax.StateFeedback(numbers[1]))
+
+    def cost(numbers: Any, starts: Any, steps: int) -> Any:
+        options = settings(steps) | {"checkpoint": checkpoint, "derivative": "pathwise", "metrics": EffortAndTravel()}
+        effort, travel = jax.vmap(lambda start: cpjax.measure(plant, law(numbers), start, **options))(starts)
+        return effort.mean(), travel
 
     function = jax.value_and_grad(cost, has_aux=True) if reverse else cost
     compiled = jax.jit(function, static_argnums=2)
 
     def run(starts: Any, steps: int) -> Any:
-        first, second = compiled(controller, starts, steps)
+        first, second = compiled(numbers, starts, steps)
         return first[1] if reverse else second
 
     def temporary(starts: Any, steps: int) -> Any:
-        memory: Any = compiled.lower(controller, starts, steps).compile().memory_analysis()
+        memory: Any = compiled.lower(numbers, starts, steps).compile().memory_analysis()
         return memory.temp_size_in_bytes
 
     run.temporary = temporary  # type: ignore[attr-defined]  # a function may have attributes
@@ -141,12 +167,15 @@ CONTENDERS: dict[str, tuple[Callable[[Task], Run], str]] = {
     "cpjax, one start, 10 ms": (partial(cpjax_one, compiled=True, **LONG_STEPS), "continuous clock, steps of 10 ms"),
     "cpjax, values of 64": (partial(cpjax_gradient, reverse=False), "a cost, under vmap"),
     "cpjax, gradient": (cpjax_gradient, "a cost and its gradient, reverse mode"),
-    "cpjax, values of 64, less code": (partial(cpjax_gradient, reverse=False), "after configure_cpu(gradients=True)"),
-    "cpjax, gradient, less code": (cpjax_gradient, "the same after cpjax.configure_cpu(gradients=True)"),
-    "cpjax, gradient with options": (cpjax_gradient, "the same after cpjax.configure_cpu"),
-    "cpjax, gradient, less code, every step": (
+    "cpjax, values of 64, configured": (partial(cpjax_gradient, reverse=False), "after cpjax.configure_cpu"),
+    "cpjax, gradient, configured": (cpjax_gradient, "the same after cpjax.configure_cpu"),
+    "cpjax, gradient, configured, every step": (
         partial(cpjax_gradient, checkpoint="every_step"),
         "likewise, more remembered",
+    ),
+    "cpjax, gradient in 5, configured, every step": (
+        partial(cpjax_gradient, checkpoint="every_step", few=True),
+        "likewise, in the energy gain and K alone",
     ),
     "plain JAX scan": (plain_scan, "lax.scan under vmap, largest |x| only"),
     "diffrax, Heun": (diffrax_steps, "2nd order, continuous clock, no metrics"),
@@ -159,8 +188,8 @@ CONTENDERS: dict[str, tuple[Callable[[Task], Run], str]] = {
     "python-control": (python_control, "trajectories"),
     "SciPy": (scipy_solver, "DOP853, largest |x| only"),
 }
-CONFIGURED = ("cpjax", "cpjax, every 10th sample", "cpjax, every sample", "cpjax, gradient with options")
-"""Those after `cpjax.configure_cpu`, which is for all of them but the gradient."""
+CONFIGURED = ("cpjax", "cpjax, every 10th sample", "cpjax, every sample")
+"""Those after `cpjax.configure_cpu`, beside those that say so in their names."""
 
 CONTINUOUS = ("cpjax, one start, 10 ms", "diffrax, Heun", "diffrax, Tsit5", "jaxonomy, RK4", "jaxonomy, its own steps")
 """Those on the other clock, checked on it against steps of 2 ms through located switches."""
@@ -177,8 +206,8 @@ def measure(name: str, task: Task) -> dict[str, Any]:
     jax.config.update("jax_enable_x64", True)  # type: ignore[no-untyped-call]  # untyped in JAX
     import cpjax
 
-    if name in CONFIGURED or "less code" in name:
-        cpjax.configure_cpu(devices=task.cores, gradients="less code" in name)
+    if name in CONFIGURED or "configured" in name:
+        cpjax.configure_cpu(devices=task.cores)
     else:
         jax.config.update("jax_num_cpu_devices", task.cores)  # type: ignore[no-untyped-call]  # untyped in JAX
     starts = jax.tree.map(
