@@ -94,7 +94,7 @@ def _measure(design: Any, work: str, quick: bool) -> float:
 
     def outside(vector: jax.Array, start: State) -> jax.Array:
         metric = TimeOutside(0.1, 0.1)
-        settings: dict[str, Any] = {"switching": "located", "spare_steps": plan.spare_steps}
+        settings: dict[str, Any] = {"switching": "located", "spare_steps": plan.spare_steps, "checkpoint": "every_step"}
         found: jax.Array = measure(
             plant, free.build(vector), start, duration=duration, dt=dt, metrics=metric, **settings
         )

@@ -90,7 +90,7 @@ class _Tuner:
         self.optimiser = optax.adam(schedule)
         self.metric = ProtocolMetrics(track_limit=plan.goal.track_limit)
         self.located: dict[str, Any] = {"duration": plan.duration, "dt": plan.dt, "switching": "located"}
-        self.located["spare_steps"] = plan.spare_steps
+        self.located |= {"spare_steps": plan.spare_steps, "checkpoint": "every_step"}  # few, long steps: little memory
         self.iterations = round(plan.duration / plan.dt) + plan.spare_steps
         self.gradient = jax.jit(jax.vmap(self._gradient, in_axes=(0, None, None, None)))
         self.controllers = jax.jit(jax.vmap(self._controller))

@@ -300,6 +300,7 @@ class Tracer:
                 dt=plan.dt,
                 switching="located",
                 spare_steps=self._spare,
+                checkpoint="every_step",
                 metrics=metric,
             )
             return found
