@@ -4,8 +4,9 @@
 
 64 starts (and 4,096 in chunks of 64), 10 s at steps of 2 ms, float64, the smooth time outside the target of the
 corrected, centred law with pole placement; derivatives in eight parameters. On the sampled clock, the derivative of the
-mean beside the pathwise one. Everything is compiled first; then all ways run in turn, several times, so that a busy
-machine slows all of them. Memory is what the compiler sets aside for temporaries.
+mean beside the pathwise one. All after `configure_cpu(1)`, on one core. Everything is compiled first; then all ways run
+in turn, several times, so that a busy machine slows all of them. Memory is what the compiler sets aside for
+temporaries.
 """
 
 import time
@@ -80,8 +81,11 @@ def main(out: Path, quick: bool = False, seed: int = 1) -> list[dict[str, Any]]:
             jax.vmap(objective("sampled", "segments", duration), (None, 0)), parameters, few
         )
         for kind in ("pathwise", "mean"):
-            sampled = objective("sampled", "segments", duration, kind)
-            ways[64, "sampled", f"reverse, {kind}"] = _compiled(_gradients(sampled, "reverse"), parameters, few)
+            for checkpoint, words in (("every_step", "every step"), ("segments", "segments")):
+                sampled = objective("sampled", checkpoint, duration, kind)
+                ways[64, "sampled", f"reverse, {words}, {kind}"] = _compiled(
+                    _gradients(sampled, "reverse"), parameters, few
+                )
 
     times: dict[Any, list[float]] = {key: [] for key in ways}
     for _ in range(repeats):
@@ -158,4 +162,5 @@ def _compiled(function: Any, parameters: Any, starts: Any) -> tuple[Any, Any, fl
 
 
 if __name__ == "__main__":
+    cpjax.configure_cpu(1)
     run(main, __doc__ or "")
