@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, DebugInfo, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
 from cpjax.backend.single_kernel import is_identity
 
@@ -43,7 +43,7 @@ class _Split:
     """The operations of a function that JAX has traced: early ones, of known values alone, and late ones."""
 
     def __init__(self, jaxpr: Jaxpr, known: Sequence[bool], functions: "_Functions") -> None:
-        self._results = jaxpr.outvars
+        self._jaxpr, self._results = jaxpr, jaxpr.outvars
         self._known = [*jaxpr.constvars, *_where(known, jaxpr.invars)]
         self._unknown = _where(_not(known), jaxpr.invars)
         self._early: list[JaxprEqn] = []
@@ -88,7 +88,8 @@ class _Split:
         values = dict(zip(self._known, (*constants, *known), strict=True))
         for equation in self._early:
             arguments = [_value(atom, values) for atom in equation.invars]
-            results = arguments if is_identity(equation.primitive) else _computed_once(equation, arguments, memory)
+            is_mark = is_identity(equation.primitive)
+            results = arguments if is_mark else _computed_once(self._jaxpr, equation, arguments, memory)
             values.update(zip(equation.outvars, results, strict=True))
         found = [values[variable] for variable in self._needed]
         for place, call in self._calls.items():
@@ -107,7 +108,8 @@ class _Split:
                 others = _where(_not(call.given), equation.invars)
                 results = call.late(list(islice(rest, call.split.size)), [_array(atom, values) for atom in others])
             else:
-                results = _computed_once(equation, [_value(atom, values) for atom in equation.invars], memory)
+                arguments = [_value(atom, values) for atom in equation.invars]
+                results = _computed_once(self._jaxpr, equation, arguments, memory)
             values.update(zip(equation.outvars, results, strict=True))
         return [_value(atom, values) for atom in self._results]
 
@@ -161,24 +163,25 @@ def _array(atom: Any, values: dict[Any, Any]) -> Any:
     return np.asarray(atom.val, aval.dtype) if isinstance(atom, Literal) else values[atom]
 
 
-def _computed(equation: JaxprEqn, arguments: _Values) -> _Values:
+def _computed(jaxpr: Jaxpr, equation: JaxprEqn, arguments: _Values) -> _Values:
+    """Returns the results of an operation of this function."""
     values = {v: value for v, value in zip(equation.invars, arguments, strict=True) if isinstance(v, Var)}
-    words = DebugInfo("hoisted", equation.primitive.name, None, None)
+    words = jaxpr.debug_info._replace(arg_names=None, result_paths=None)
     alone = Jaxpr((), list(values), equation.outvars, [equation], equation.effects, words)
     return list(jaxpr_as_fun(ClosedJaxpr(alone, ()))(*values.values()))
 
 
-def _computed_once(equation: JaxprEqn, arguments: _Values, memory: _Memory) -> _Values:
+def _computed_once(jaxpr: Jaxpr, equation: JaxprEqn, arguments: _Values, memory: _Memory) -> _Values:
     """Returns what `_computed` does; of equal operations on the same values the first result."""
     atoms = zip(equation.invars, arguments, strict=True)
     same = [(repr(a.val), str(a.aval)) if isinstance(a, Literal) else id(value) for a, value in atoms]
     if equation.effects:
-        return _computed(equation, arguments)
+        return _computed(jaxpr, equation, arguments)
     key = (equation.primitive, tuple(sorted(equation.params.items(), key=lambda item: item[0])), tuple(same))
     try:
         hash(key)
     except TypeError:  # a parameter without a hash
-        return _computed(equation, arguments)
+        return _computed(jaxpr, equation, arguments)
     if key not in memory:
-        memory[key] = (arguments, _computed(equation, arguments))
+        memory[key] = (arguments, _computed(jaxpr, equation, arguments))
     return memory[key][1]
