@@ -143,6 +143,7 @@ int gradient(const parameters *given, long n, long steps, const real *starts, re
     const constants k = following(given);
     kept *tape = aligned_alloc(64, sizeof(kept) * VECTORS * (size_t)steps);
     if (!tape) return 1;
+    const unsigned long before = flush_subnormals();
     for (long first = 0; first < n; first += LANES) {
         lanes block[VECTORS];
         adjoint adjoints[VECTORS];
@@ -174,6 +175,7 @@ int gradient(const parameters *given, long n, long steps, const real *starts, re
             for (int m = 0; m < NUMBERS; m++) results[(2 + m) * n + first + i] = found[v].of[m][j];
         }
     }
+    restore(before);
     free(tape);
     return 0;
 }

@@ -26,6 +26,7 @@ from cpjax.sim.metrics import Metrics, ProtocolMetrics
 FOLDER = Path(__file__).parent
 VALUES, GRADIENT = FOLDER / "roofline.c", FOLDER / "gradient.c"
 FLAGS = ["-O3", "-march=native", "-ffp-contract=fast", "-fopenmp", "-shared", "-fPIC", "-Wno-psabi"]
+FLAGS += os.environ.get("CFLAGS", "").split()
 TRIALS = 5
 TRIAL_STEPS = 4_000_000
 """Steps of a trial, all starts together."""
@@ -70,7 +71,7 @@ class Form(NamedTuple):
 
 
 def compiler() -> str | None:
-    """Returns the C compiler: $CC, or the system's; None if there is none."""
+    """Returns the C compiler: $CC, or the system's; None if there is none. ($CFLAGS are its further flags.)"""
     return shutil.which(os.environ.get("CC", "cc"))
 
 
