@@ -1,7 +1,10 @@
 """Loops that the compiler makes one function of: which ones, and that nothing but speed depends on it."""
 
 import contextlib
+import dataclasses
+import importlib
 import warnings
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -249,3 +252,16 @@ def test_a_law_that_calls_another_library_works_as_ever(function):
         assert WHOLE not in lowered(lambda theta: effort(near(theta), controller), 2.8)
     with warnings.catch_warnings(action="ignore"):
         assert np.isfinite(effort(near(2.8), controller))
+
+
+def test_reverse_mode_through_the_elements_of_a_vector_in_the_memory_is_forward_mode(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1]))
+    controller, start = importlib.import_module("extensions.observer").example()
+
+    def outside(scale):
+        law = dataclasses.replace(controller, gain=scale * controller.gain)
+        settings = {"duration": 0.5, "dt": 0.002, "derivative": "pathwise", "metrics": cpjax.TimeOutside()}
+        return cpjax.measure(PLANT, law, dataclasses.replace(start, x=start.x + 0.01), **settings)
+
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(jax.grad(outside)(1.0), jax.jacfwd(outside)(1.0), rtol=1e-9)
