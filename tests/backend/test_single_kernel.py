@@ -190,7 +190,7 @@ def zoo(law, state):
     smooth += [jnp.cbrt(2.0 + jnp.sin(x)), jax.nn.sigmoid(v), jnp.arctan2(x, 1.0 + v * v), (2.0 + jnp.sin(x)) ** 1.7]
     steps = [jnp.floor(3.0 * x), jnp.ceil(v), jnp.round(theta), jnp.sign(omega), jnp.mod(theta, 2.0), jnp.abs(v)]
     steps += [jnp.clip(omega, -1.0, 1.0), jnp.where(jnp.isfinite(x), 1.0, 0.0), jnp.maximum(x, v) - jnp.minimum(x, v)]
-    table = jnp.concatenate([jnp.stack([x, v]), jnp.pad(jnp.stack([theta, omega]), 1)])[::-1]
+    table = jnp.concatenate([jnp.stack([x, v]), jnp.stack([0.0 * x, theta, omega, 0.0 * x])])[::-1]
     taken = jax.lax.dynamic_slice(table, (jnp.int32(law.gain > 0) + 1,), (2,)).sum() + table.reshape(2, 3).T[1, 0]
     looped = jax.lax.fori_loop(0, 3, lambda _, y: 0.5 * y + x, v) + jax.lax.while_loop(
         lambda y: y > 1.0, lambda y: 0.5 * y, jnp.abs(theta)
