@@ -80,7 +80,7 @@ class _Marks:
         self.results: Any = Primitive(f"results_of_{kind}")
         self.arguments: Any = Primitive(f"arguments_of_{kind}")
         self.cotangents: Any = Primitive(f"cotangents_of_{kind}")
-        _define(self.results, None)
+        _define(self.results, None)  # their cotangents are results of other calls, which are not to be marked
         _define(self.arguments, self.cotangents)
         _define(self.cotangents, self.arguments)
 
@@ -217,21 +217,21 @@ def _others(function: Any, symbols: Any) -> set[str]:
     names = _ALLOWED.split()
     waiting, known, others = [(function, False)], {(function.attributes["sym_name"].value, False)}, set()
 
-    def looked_at(operation: Any, repeated: bool) -> Any:
-        repeated = repeated or _is_in_a_loop(operation)
+    def look(operation: Any, in_a_loop: bool) -> Any:
         if operation.name == "func.call":
-            called = (operation.attributes["callee"].value, repeated)
+            called = (operation.attributes["callee"].value, in_a_loop or _is_in_a_loop(operation))
             if called not in known:
                 known.add(called)
-                waiting.append((symbols[called[0]], repeated))
+                waiting.append((symbols[called[0]], called[1]))
         large = operation.name == "stablehlo.reduce" and _size(operation.operands[0]) >= LARGEST_SUM
-        if large or operation.name not in names or (repeated and operation.name == "stablehlo.pad"):
+        wrong = operation.name == "stablehlo.pad" and (in_a_loop or _is_in_a_loop(operation))
+        if large or wrong or operation.name not in names:
             others.add(operation.name)
         return ir.WalkResult.ADVANCE
 
     while waiting:
-        next_one, repeated = waiting.pop()
-        next_one.operation.walk(functools.partial(looked_at, repeated=repeated))
+        next_one, in_a_loop = waiting.pop()
+        next_one.operation.walk(functools.partial(look, in_a_loop=in_a_loop))
     return others
 
 

@@ -174,7 +174,8 @@ def _computed(jaxpr: Jaxpr, equation: JaxprEqn, arguments: _Values) -> _Values:
 def _computed_once(jaxpr: Jaxpr, equation: JaxprEqn, arguments: _Values, memory: _Memory) -> _Values:
     """Returns what `_computed` does; of equal operations on the same values the first result."""
     atoms = zip(equation.invars, arguments, strict=True)
-    same = [(repr(a.val), str(a.aval)) if isinstance(a, Literal) else id(value) for a, value in atoms]
+    # By their bits: equal numbers may differ (0.0 and -0.0), and different ones may print alike.
+    same = [(np.asarray(a.val).tobytes(), str(a.aval)) if isinstance(a, Literal) else id(v) for a, v in atoms]
     if equation.effects:
         return _computed(jaxpr, equation, arguments)
     key = (equation.primitive, tuple(sorted(equation.params.items(), key=lambda item: item[0])), tuple(same))
